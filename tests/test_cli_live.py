@@ -21,6 +21,7 @@ from processes import PACKAGE, Forked
 from videos import H264, clip, piped
 
 from dejavu_torch import DejaVu, LiveLocalizer, PlaceFilter, SpectralMapper, Whitening, open_source
+from dejavu_torch.data.traverse import at_size
 from dejavu_torch.live.page import Page
 
 KEYS = ["frame", "time", "place", "reference_frame", "name", "score", "posterior", "probability", "accepted"]
@@ -92,7 +93,7 @@ def test_with_a_lag_each_frame_has_its_line_later(lag, folder, capsys, monkeypat
     assert [line["time"] for line in found] == pytest.approx([i / 25 for i in range(64)])
     model = DejaVu.load(folder / "map.safetensors")
     localizer = LiveLocalizer(model, PlaceFilter(lag=lag))
-    frames = open_source(folder / "second.mkv", model.frame_shape[1:])  # type: ignore[index,arg-type]
+    frames = at_size(open_source(folder / "second.mkv"), model.frame_shape[1:])  # type: ignore[index,arg-type]
     expected = [match for frame in frames for match in localizer.due(frame)] + localizer.finish()
     assert [line["place"] for line in found] == [one.place for one in expected]
     assert [line["posterior"] for line in found] == pytest.approx(
@@ -229,3 +230,15 @@ def test_a_process_that_nobody_needs_any_more_ends(how, folder, tmp_path):
 )
 def test_mistakes_are_one_line(words, told, folder, capsys):
     assert told in fails(capsys, "live", folder / "map.safetensors", *words.split())
+
+
+def test_a_file_is_opened_once(folder, monkeypatch):
+    import dejavu_torch.cli.live as command
+
+    opened = []
+    monkeypatch.setattr(command, "open_source", lambda source: opened.append(source) or open_source(source))
+    frames, *_ = command.frames_from(
+        str(folder / "second.mkv"), DejaVu.load(folder / "map.safetensors"), False
+    )
+    assert next(iter(frames)).pixels.shape[-2:] == DejaVu.load(folder / "map.safetensors").frame_shape[1:]
+    assert len(opened) == 1

@@ -17,6 +17,7 @@ from dejavu_torch.area import same_windows
 from dejavu_torch.cli.process import interrupts_raise, output_problem
 from dejavu_torch.data.camera import Camera, Frame, is_stream, shots_of, stretched
 from dejavu_torch.data.source import open_source
+from dejavu_torch.data.traverse import at_size
 from dejavu_torch.data.turning import Turned, facing_north
 from dejavu_torch.live.feed import FrameReader, in_real_time
 from dejavu_torch.live.localizer import LiveLocalizer, LiveMatch
@@ -137,11 +138,12 @@ def frames_from(
         camera = Camera(source, size)
         expect(not realtime, "a video file with it", f"--realtime: {camera.name} is live already")
         return _with_warning(camera), True, camera.name, False
-    own, traverse = open_source(source).frame_shape, open_source(source, size)
-    if traverse.frame_shape != own and size is not None:
-        note = stretched(traverse.name, (own[1], own[2]), size)
-        if note:
+    traverse = open_source(source)
+    own = traverse.frame_shape[1:]
+    if size is not None and len(own) == 2 and own != size and not traverse.sized:
+        if note := stretched(traverse.name, own, size):
             log.warning("%s", note)
+        traverse = at_size(traverse, size)
     traverse = facing_north(traverse, model.map.area)
     frames = shots_of(traverse)
     if realtime or shown:

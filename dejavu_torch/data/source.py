@@ -67,7 +67,7 @@ def as_traverse(source: Source) -> Traverse:
     raise InputError(f"{seen}; expected a Traverse, {expected}")
 
 
-def open_source(source: str | Path, size: tuple[int, int] | None = None) -> Traverse:
+def open_source(source: str | Path) -> Traverse:
     """Open a source of frames or features.
 
     Args:
@@ -85,7 +85,6 @@ def open_source(source: str | Path, size: tuple[int, int] | None = None) -> Trav
             [start, stop). `coordinates=FILE` tells where frames were taken, see `read_coordinates`.
             `mask=IMAGE` makes what is black in an image black in all frames, then
             `crop=TOP,BOTTOM,LEFT,RIGHT` removes pixels.
-        size: (height, width) in pixels to resize images and videos to if the source sets neither.
 
     Raises:
         InputError: missing, empty, or unreadable.
@@ -102,9 +101,6 @@ def open_source(source: str | Path, size: tuple[int, int] | None = None) -> Trav
     arguments = _arguments(text, query, reader)
     part = {name: arguments.pop(name) for name in PART if name in arguments}
     file, crop, mask = (arguments.pop(name, "") for name in ("coordinates", "crop", "mask"))
-    resizes = getattr(reader, "func", None) in (ImageFolder, Video) and not crop
-    if size is not None and resizes and not {"height", "width"} & arguments.keys():
-        arguments["height"], arguments["width"] = size
     traverse = reader(**arguments)
     if crop or mask:
         hidden = read_image(Path(mask)).mean(0, keepdim=True) if mask else None

@@ -10,9 +10,10 @@ from bisect import bisect_right
 from collections.abc import Generator, Iterator
 from contextlib import contextmanager
 from fractions import Fraction
-from functools import cache
+from functools import cache, lru_cache
 from itertools import islice
 from pathlib import Path
+from threading import get_ident
 from time import monotonic
 from typing import TYPE_CHECKING, Any, BinaryIO
 
@@ -30,6 +31,7 @@ from dejavu_torch.types import Facts, InputError, Traverse, expect
 if TYPE_CHECKING:
     from av import VideoFrame
     from av.container import InputContainer
+    from av.filter import Graph
     from av.video.stream import VideoStream
 
 log = logging.getLogger("dejavu_torch")
@@ -49,6 +51,8 @@ UNEVEN_RATIO = 1.5  # of the longest to the median interval; rounding to half a 
 Index = tuple[list[Any], list[int], Fraction | None]  # time stamps, key frames, seconds of a stamp
 # SWS_FULL_CHR_H_INT and _INP, which only new versions of av name; else colours are averaged over two columns
 FULL_CHROMA = 0x6000
+HDR = 16, 18  # transfer functions, as FFmpeg numbers them: SMPTE ST 2084 (PQ) and HLG
+EXACT = "gbrp16le"  # pixels until their brightness is changed
 _FORKED: list[object] = []  # decoders of parent processes
 
 
@@ -59,7 +63,7 @@ class Video(Traverse):
         path: a video file of any container and codec that FFmpeg reads.
         width, height: in pixels, resized by areas; 0 for both keeps the size, 0 for one the aspect ratio.
 
-    Shape: frames (n,3,H,W), always RGB, rotated upright as the file says.
+    Shape: frames (n,3,H,W), always RGB of BT.709, rotated upright as the file says.
 
     Convention: a frame's name is its time, as 0:01:23.480. Opening reads the times of all frames, without
         decoding them where the file lists them (.mp4, .mov, .mkv, .webm, most .avi); a variable frame rate
@@ -285,9 +289,41 @@ def pixels_of(frame: VideoFrame, path: Path, width: int = 0, height: int = 0) ->
     if turns % 2:
         width, height = height, width
     check_pixels(path, height, width, MOST_PIXELS)
+    kind = EXACT if frame.color_trc in HDR else "rgb24"
     # threads of its own cost each frame more than they save, and would be waited for in a forked process
-    picture = frame.reformat(width, height, "rgb24", interpolation=how, threads=1)
+    picture = frame.reformat(width, height, kind, interpolation=how, threads=1)
+    if kind == EXACT:
+        picture = _mapped(picture, frame.color_trc, frame.color_primaries)
     return np.rot90(picture.to_ndarray(), turns)
+
+
+def _mapped(picture: VideoFrame, transfer: int, primaries: int) -> VideoFrame:
+    """A picture of high dynamic range as "rgb24" of the usual one: white, 203 cd/m2, becomes 255, and what is
+    brighter is cut off."""
+    picture.color_trc, picture.color_primaries = transfer, primaries
+    graph = _graph((os.getpid(), get_ident()), picture.width, picture.height)
+    graph.vpush(picture)
+    return graph.vpull()
+
+
+@lru_cache(4)  # as the first picture of each takes seconds
+def _graph(thread: tuple[int, int], width: int, height: int) -> Graph:
+    from av import VideoFormat
+    from av.filter import Graph
+
+    graph = Graph()
+    graph.threads = 1
+    source = graph.add_buffer(
+        width=width, height=height, format=VideoFormat(EXACT), time_base=Fraction(1, 1000)
+    )
+    graph.link_nodes(
+        source,
+        graph.add("scale", "out_transfer=bt709:out_primaries=bt709"),
+        graph.add("format", "rgb24"),
+        graph.add("buffersink"),
+    )
+    graph.configure()
+    return graph
 
 
 def seconds_of(stamp: int | None, base: Fraction | None) -> float:

@@ -11,7 +11,7 @@ import pytest
 import torch
 from helpers import all_of, refused
 from torch.nn.functional import avg_pool2d
-from videos import H264, clip, numbers, pictures
+from videos import H264, clip, high_range, numbers, pictures
 
 from dejavu_torch.data import video as video_module
 from dejavu_torch.data.names import clock_time
@@ -240,3 +240,14 @@ def test_a_stream_that_claims_too_many_pixels_is_refused(tmp_path, monkeypatch):
     monkeypatch.setattr(video_module, "MOST_PIXELS", 1000)
     with refused("a.mkv has 32 x 48 pixels", "at most 1000"):
         Video(path)
+
+
+@pytest.mark.parametrize("transfer", [16, 18])
+def test_high_dynamic_range_becomes_the_usual_one(tmp_path, transfer):
+    line = np.linspace(16, 235, 64).round().astype(np.uint8)[None].repeat(48, 0)
+    shown = np.stack([line, line // 2, 200 - line // 2], -1)
+    frames = np.stack([shown, shown[:, ::-1]])
+    path = clip(tmp_path / "a.mkv", high_range(frames, transfer), pixels="yuv420p10le", transfer=transfer)
+    wanted = torch.from_numpy(frames).permute(0, 3, 1, 2) / 255
+    assert float((all_of(Video(path)) - wanted).abs().mean()) < 0.01
+    assert float((all_of(Video(path, width=32)) - avg_pool2d(wanted, 2)).abs().mean()) < 0.01
