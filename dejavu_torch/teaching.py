@@ -135,7 +135,9 @@ def refine(model: DejaVu, drive: Source, progress: bool = False) -> Refinement:
         >>> print(refine(model, torch.rand(40, 8)))
         0 of 40 frames placed; nothing is learned, the map stays as it was
     """
-    return refined_by(model, described(model, drive, "refine", progress)[1])
+    refined = refined_by(model, described(model, drive, "refine", progress)[1])
+    refined.into(model)
+    return refined.told
 
 
 def described(model: DejaVu, drive: Source, verb: str, progress: bool = False) -> tuple[Traverse, Tensor]:
@@ -152,34 +154,47 @@ def described(model: DejaVu, drive: Source, verb: str, progress: bool = False) -
     return traverse, model.descriptor.all_of(traverse, progress).float().to(place_map.device)
 
 
+class Refined(NamedTuple):
+    """A map that a drive has taught, or as it was, and its calibration."""
+
+    told: Refinement
+    map: SpectralMap
+    calibration: Calibration | None
+
+    def into(self, model: DejaVu) -> None:
+        """Give them to a model."""
+        if self.map is not model.map:
+            model.replace_map(self.map)
+            model.calibration = self.calibration
+
+
 @torch.no_grad()
-def refined_by(model: DejaVu, descriptors: Tensor) -> Refinement:
-    """As `refine`, by the descriptors (Q,K) of a drive."""
-    place_map = model.map
+def refined_by(model: DejaVu, descriptors: Tensor) -> Refined:
+    """As `refine`, by the descriptors (Q,K) of a drive; the model stays as it is."""
+    place_map, calibration = model.map, model.calibration
     assert isinstance(place_map, SpectralMap)
     places = place_drive(model, descriptors).to(place_map.device)
     sure = (places >= 0).nonzero()[:, 0]
     count, queries = len(places), in_its_light(model, descriptors)
     if not len(sure):
-        return Refinement(0, count)
+        return Refined(Refinement(0, count), place_map, calibration)
     tau, gains = spacing_of(queries).correlation, torch.zeros(count)
     before, asked = _log_ranks(place_map, queries, places), []
     for fold in torch.arange(count).tensor_split(FOLDS):
         far = (sure < int(fold[0]) - APART * tau) | (sure > int(fold[-1]) + APART * tau)
         if int(far.sum()) < LEAST:
-            return Refinement(len(sure), count)
+            return Refined(Refinement(len(sure), count), place_map, calibration)
         refined = place_map.refined(_stage(place_map, queries, places, sure[far]))
         gains[fold] = (before - _log_ranks(refined, queries, places))[fold]
         asked.append((refined, descriptors[fold.to(descriptors.device)]))
     blocks = torch.stack([block.mean() for block in gains[sure.cpu()].split(math.ceil(tau))])
     gain, error = float(blocks.mean()), float(blocks.std() / math.sqrt(len(blocks)))
     if accepted := gain > ERRORS * error:
-        calibrated = model.calibration is not None
-        model.replace_map(place_map.refined(_stage(place_map, queries, places, sure)))
-        if calibrated:  # by maps that have not learned from what they are asked
+        place_map = place_map.refined(_stage(place_map, queries, places, sure))
+        if calibration is not None:  # by maps that have not learned from what they are asked
             scores = (part.scores(rows) for part, own in asked for rows in own.split(_at_once(place_map)))
-            model.calibration = _calibration(model.map, queries, places, scores)
-    return Refinement(len(sure), count, gain, error, accepted)
+            calibration = _calibration(place_map, queries, places, scores)
+    return Refined(Refinement(len(sure), count, gain, error, accepted), place_map, calibration)
 
 
 @torch.no_grad()

@@ -109,11 +109,14 @@ def update(
     sure = (answers.match.probability[:, 0] >= SURE).sum()  # type: ignore[index]
     if not smoother.is_drive or int(sure) < max(NEWEST, SHARE * len(descriptors)):
         return Update(None, False)
-    refinement = refined_by(model, descriptors) if len(descriptors) >= FEWEST else None
-    place_map, queries = model.map, in_its_light(model, descriptors)
+    refined = refined_by(model, descriptors) if len(descriptors) >= FEWEST else None
+    refinement = refined and refined.told
+    place_map, queries = refined.map if refined else model.map, in_its_light(model, descriptors)
     assert isinstance(place_map, SpectralMap)
     stretches, unknown, answers = _new_ground(place_map, queries, progress)
     if not stretches:
+        if refined:
+            refined.into(model)
         return Update(refinement, True, unknown=tuple(unknown))
     grown, links, names, shown = place_map, [*place_map.connections], [], [model.frame_names]
     for first, last in stretches:
@@ -126,7 +129,7 @@ def update(
         grown = grown.with_route(names[-1], _coded(place_map, rows), own)
         shown.append(_names_of(traverse, frames))
     sizes = [place_map.table.frames, *(last - first for first, last in stretches)]
-    calibration = model.calibration
+    calibration = refined.calibration if refined else model.calibration
     model.frame_names = joined_names(shown, sizes)
     model.replace_map(grown.linked(links))
     model.calibration = calibration

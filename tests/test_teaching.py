@@ -34,6 +34,7 @@ from dejavu_torch.growth import (
 from dejavu_torch.maps.spectral_map import SpectralMap
 from dejavu_torch.recognition.coarse import CoarseSearch, SamplingPlan
 from dejavu_torch.teaching import FEWEST, ROUNDS, SURE, place_drive, refine
+from dejavu_torch.updating import update
 
 FRAMES, FIRST, LAST = 160, 20, 140
 
@@ -412,6 +413,35 @@ def test_a_calibration_is_learned_anew_from_all_of_a_drive():
     assert match.probability is not None
     right = ((match.index - torch.arange(300)).abs() <= 5).double()
     assert abs(float(match.probability.mean() - right.mean())) < 0.1
+
+
+@pytest.mark.parametrize("verb", ["refine", "update"])
+def test_a_model_stays_as_it_is_if_a_drive_fails(verb, monkeypatch):
+    import dejavu_torch.teaching as teaching
+    import dejavu_torch.updating as updating
+
+    def full(*_):
+        raise MemoryError("full")
+
+    rows = waves(400)
+    model = model_of(rows[:300])
+    model.calibrate(None, LabelledFrames(ArrayTraverse(noisy(rows[:300], size=0.1)), torch.arange(300)))
+    before = model.map, model.calibration
+    drive = changed(rows)
+    if verb == "refine":
+        monkeypatch.setattr(teaching, "_calibration", full)
+    else:
+        monkeypatch.setattr(updating, "_coded", full)  # after it has taught
+    with pytest.raises(MemoryError):
+        (refine if verb == "refine" else update)(model, drive)
+    assert all(
+        one is other
+        for one, other in zip(before, (model.map, model.calibration, model.frame_names), strict=True)
+    )
+    monkeypatch.undo()
+    assert update(model, drive).stretches
+    assert model.map is not before[0]
+    assert model.calibration is not before[1]
 
 
 def test_the_command_refines_a_map(tmp_path, capsys):
