@@ -1,0 +1,129 @@
+"""What can be added from outside, each in at most 25 lines: a map (test_seam.py), a way to match, and later a
+layout, a baseline, a wrapper of scores and a motion."""
+
+from __future__ import annotations
+
+import inspect
+
+import pytest
+import torch
+
+from dejavu_torch import DejaVu, SpectralMapper, compare
+from dejavu_torch.data.arrays import ArrayTraverse
+from dejavu_torch.types import SequenceModel
+
+LINES = 25
+MISSING = (ImportError, TypeError)  # the noun, or an argument that takes one
+
+
+def waves(visit, places=120):
+    """Descriptors of a route, seen once more at each visit."""
+    route = torch.randn(places + 3, 16, generator=torch.Generator().manual_seed(0))
+    route = torch.nn.functional.avg_pool1d(route.T[None], 4, 1)[0].T
+    noise = torch.randn(places, 16, generator=torch.Generator().manual_seed(1 + visit))
+    return ArrayTraverse(route + 0.1 * noise, f"visit {visit}")
+
+
+def model():
+    return DejaVu(None, "none", mapper=SpectralMapper(24.0))
+
+
+class Doubled(SequenceModel):
+    """A way: the mean of the scores of this query and the one before, a place earlier."""
+
+    def start(self, places, fixed=False):
+        return torch.full((int(fixed), places), torch.nan)
+
+    def step(self, scores, state, route_starts=(0,)):
+        before = torch.cat([state, scores])[-len(scores) - 1 : -1]
+        before = torch.cat([scores.new_full((len(scores) - len(before), scores.shape[1]), torch.nan), before])
+        before = before.roll(1, 1).index_fill(1, torch.tensor(route_starts), torch.nan)
+        return torch.where(before.isfinite(), (scores + before) / 2, scores), scores[-1:]
+
+    def check(self, queries, places):
+        pass
+
+
+def test_a_way(tmp_path):
+    found = compare(waves(0), waves(1), "0", model(), sequence=Doubled())
+    report = found.report.as_json()
+    assert report["recall_at_1"] > 0.95
+    assert report["answers"] == "sequence"
+    single = compare(waves(0), waves(1), "0", model(), sequence=None).report
+    assert report["recall_at_1"] >= single.as_json()["recall_at_1"]
+    one_by_one = model().learn(waves(0)).localize(waves(1), sequence=Doubled())
+    assert torch.equal(one_by_one.index, found.run.match.index)
+
+
+@pytest.mark.xfail(raises=MISSING, strict=True)
+def test_a_layout():
+    from dejavu_torch.places import Layout
+
+    class Ring(Layout):
+        """Places around a square, whose last is beside the first."""
+
+        def apart(self, one, other):
+            far = (one - other).abs()
+            return torch.minimum(far, self.places - far)
+
+    seen = waves(1)
+    found = compare(waves(0), seen, "0", model(), layout=Ring(120), top=3, tolerance=5)
+    best = found.candidates.index
+    gaps = (best[:, :, None] - best[:, None]).abs()
+    assert int(torch.minimum(gaps, 120 - gaps)[:, ~torch.eye(3, dtype=torch.bool)].min()) > 5
+    assert found.report.as_json()["recall_at_1"] > 0.95
+
+
+@pytest.mark.xfail(raises=MISSING, strict=True)
+def test_a_baseline():
+    from dejavu_torch.recognition.scorer import Scorer
+
+    class Signs(Scorer):
+        """The signs of all descriptors: a bit for each number."""
+
+        def rows(self, queries):
+            return (self.asked[queries].sign()[:, None] - self.kept.sign()).abs().sum(2)
+
+    reference, query = waves(0), waves(1)
+    bits = Signs(asked=query.features, kept=reference.features)
+    report = compare(reference, query, "0", model(), contenders={"signs": ("signs", 120 * 2, bits)}).report
+    assert report.as_json()["signs"]["recall_at_1"] > 0.9
+
+
+@pytest.mark.xfail(raises=MISSING, strict=True)
+def test_a_wrapper():
+    from dejavu_torch.recognition.scorer import Wrapped
+
+    class Without(Wrapped):
+        """Scores without some of the places."""
+
+        def rows(self, queries):
+            return self.scorer.rows(queries).index_fill(1, self.closed, torch.inf)
+
+    closed = torch.arange(20, 40)
+    match = model().learn(waves(0)).localize(waves(1), wrapped=lambda scorer: Without(scorer, closed=closed))
+    assert not torch.isin(match.index, closed).any()
+
+
+@pytest.mark.xfail(raises=MISSING, strict=True)
+def test_a_motion():
+    from dejavu_torch.recognition.engine import Motion, Smoother
+
+    class Stairs(Motion):
+        """Moves by exactly two places, or stays."""
+
+        def moved(self, belief):
+            return 0.5 * belief + 0.5 * torch.nn.functional.pad(belief, (2, 0))[..., :-2]
+
+        def expected(self, message):
+            return 0.5 * message + 0.5 * torch.nn.functional.pad(message, (0, 2))[..., 2:]
+
+    every = waves(1)[::2]
+    match = model().learn(waves(0)).localize(ArrayTraverse(every, "every 2nd"), sequence=Smoother(Stairs()))
+    assert torch.equal(match.index, torch.arange(0, 120, 2))
+
+
+@pytest.mark.parametrize("added", [Doubled, test_a_layout, test_a_baseline, test_a_wrapper, test_a_motion])
+def test_an_addition_is_short(added):
+    lines = [line for line in inspect.getsource(added).splitlines() if line.strip()]
+    assert len(lines) <= LINES

@@ -1,0 +1,88 @@
+"""How often the expensive things are done: rows of scores, moves of a belief, and frames described.
+
+A change may do them less often, and then writes here how often.
+"""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from dejavu_torch import (
+    HOG,
+    DejaVu,
+    PlaceFilter,
+    PlaceSmoother,
+    SpectralMapper,
+    Whitening,
+    compare,
+    open_source,
+)
+from dejavu_torch.maps.spectral_map import SpectralMap
+from dejavu_torch.recognition.motion import Motion
+from dejavu_torch.recognition.plane import PlaneMotion
+from dejavu_torch.recognition.samples import RowSearch
+
+SLACK = 0.1  # rounds of learning how a camera moves end a little earlier or later on another processor
+ROUTE = [f"sim:aerial?seed=1&traverse={visit}&frames=150&size=32" for visit in (0, 1)]
+AREA = (
+    "demo:area?rows=16:96&stride=16&columns=0:512",
+    "demo:area?traverse=1&rows=16:96&stride=16&columns=0:512",
+)
+
+
+@pytest.fixture
+def counts(monkeypatch):
+    """Counts rows of scores, rows that move, and frames described."""
+    found = {"searched": 0, "scored": 0, "moved": 0, "described": 0}
+
+    def counting(owner, method, what, of):
+        plain = getattr(owner, method)
+
+        def counted(self, *given, **named):
+            found[what] += of(*given)
+            return plain(self, *given, **named)
+
+        monkeypatch.setattr(owner, method, counted)
+
+    counting(SpectralMap, "products", "scored", lambda queries, _: len(queries))
+    counting(RowSearch, "__call__", "searched", lambda queries, _: len(queries))
+    counting(Motion, "moved", "moved", lambda belief: belief[..., 0].numel())
+    counting(PlaneMotion, "moved", "moved", lambda belief: belief[..., 0].numel())
+    counting(HOG, "forward", "described", len)
+    return found
+
+
+def model():
+    return DejaVu(HOG(), Whitening(48, views=1), mapper=SpectralMapper(24.0))
+
+
+def localized(sequence):
+    def run():
+        model().learn(ROUTE[0]).localize(ROUTE[1], sequence=sequence())
+
+    return run
+
+
+def compared(reference, query, truth):
+    return lambda: compare(
+        open_source(reference), open_source(query), truth, model(), ordered=True, drives="all"
+    )
+
+
+RUNS = {  # searched, scored, moved, described
+    "single": (localized(lambda: None), (150, 0, 0, 451)),
+    "filter": (localized(PlaceFilter), (0, 150, 150, 451)),
+    "drive": (localized(PlaceSmoother), (0, 1053, 1192, 451)),
+    "compare": (compared(*ROUTE, "0"), (300, 2857, 12678, 903)),
+    "compare of an area": (compared(*AREA, None), (116, 1404, 944, 765)),
+}
+
+
+@pytest.mark.parametrize("name", RUNS)
+def test_nothing_is_done_more_often(name, counts):
+    run, known = RUNS[name]
+    torch.manual_seed(0)
+    run()
+    for (what, count), before in zip(counts.items(), known, strict=True):
+        assert before * (1 - SLACK) <= count <= before * (1 + SLACK), what
