@@ -34,7 +34,6 @@ Supportive Feature Frequencies" (IROS 2017). From the paper's sections to the co
 
 from __future__ import annotations
 
-from importlib import import_module
 from typing import TYPE_CHECKING
 
 from dejavu_torch.lazy import homes_of, lazily
@@ -103,10 +102,4 @@ _NAMES = {
 }
 _HOMES = homes_of(_NAMES)
 __all__ = sorted(_HOMES)
-_of_name, __dir__ = lazily(__name__, _NAMES)
-
-
-def __getattr__(name: str) -> object:
-    if name == "PlaceRecognitionTask":  # says what took its place
-        return import_module("dejavu_torch.training.task").PlaceRecognitionTask
-    return _of_name(name)
+__getattr__, __dir__ = lazily(__name__, _NAMES)

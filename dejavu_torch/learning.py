@@ -19,8 +19,8 @@ from dejavu_torch.data.turning import Turned
 from dejavu_torch.features.descriptor import Descriptor
 from dejavu_torch.features.shared import Blocks
 from dejavu_torch.features.views import (
+    FEWEST_FRAMES,
     LARGE,
-    LEAST,
     SAMPLE,
     SEGMENT,
     AugmentedFrames,
@@ -276,7 +276,7 @@ def descriptors_of(
     descriptor: Descriptor, views: LabelledFrames, progress: bool = False
 ) -> tuple[Tensor, Tensor]:
     """Descriptors (n,K) of the frames with a known place, and these places (n,)."""
-    rows = concatenate(descriptor.batches(views.traverse, progress, "averaging"))
+    rows = concatenate(descriptor.batches(views.traverse, progress, "averaging"), len(views.traverse))
     known = views.places.to(rows.device) >= 0
     return rows[known], views.places[known.to(views.places.device)]
 
@@ -340,16 +340,18 @@ def calibration_of(
         length = views.traverse.block
     else:
         length = max(SEGMENT, min(MAX_SEGMENT, SEGMENT_SCORES // place_map.places))
-        views = _segments_of(views, length, max(LEAST, CALIBRATION_SCORES // place_map.places))
+        views = _segments_of(views, length, max(FEWEST_FRAMES, CALIBRATION_SCORES // place_map.places))
     name = views.traverse.name
-    descriptors = concatenate(descriptor.batches(views.traverse, progress, "calibrating"))
+    descriptors = concatenate(
+        descriptor.batches(views.traverse, progress, "calibrating"), len(views.traverse)
+    )
     parts = zip(descriptors.split(length), views.places.split(length), strict=True)
     own = None
     if reference is not None and isinstance(place_map, SpectralMap):
         drawn = evenly_spaced(len(places), 1, min(OWN, len(places)))
         drawn = drawn[(places[drawn] >= 0) & (counts[places[drawn]] > 0)]
         rows = descriptor.batches(Part(reference, drawn), progress, "calibrating")
-        own = (concatenate(rows), places[drawn]) if len(drawn) else None
+        own = (concatenate(rows, len(drawn)), places[drawn]) if len(drawn) else None
     try:
         return calibrated(place_map, parts, another, own, reach)
     except InputError as error:

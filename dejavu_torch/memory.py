@@ -9,7 +9,7 @@ import tempfile
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO, ParamSpec, TypeVar
+from typing import ParamSpec, TypeVar
 
 import numpy as np
 import torch
@@ -24,7 +24,6 @@ R = TypeVar("R")
 
 IN_MEMORY = 2**29  # bytes of features that are kept in memory
 SMALL = 2**20  # numbers of an operation that one thread computes as fast as several that are disturbed
-BLOCK_BYTES = 2**26  # a tensor this large returns to the system when it is freed, a batch may not
 
 
 @contextmanager
@@ -109,84 +108,57 @@ def _size(number: float) -> str:
     return f"{number / 1e9:.3g} GB" if number >= 1e9 else f"{max(number, 0) / 1e6:.3g} MB"
 
 
-@contextmanager
-def _spilling(what: str) -> Iterator[None]:
+def empty(
+    rows: int,
+    columns: int,
+    device: torch.device,
+    in_memory: int = IN_MEMORY,
+    dtype: torch.dtype = torch.float32,
+) -> Tensor:
+    """Uninitialised (rows,columns); on the CPU, more than `in_memory` bytes are in an unnamed temporary file.
+    InputError if there is no room for it."""
+    size = dtype.itemsize * rows * columns
+    if device.type != "cpu" or size <= in_memory:
+        return torch.empty(rows, columns, dtype=dtype, device=device)
     try:
-        yield
+        with tempfile.TemporaryFile() as file:
+            if hasattr(os, "posix_fallocate"):  # a full disk would end the process later
+                os.posix_fallocate(file.fileno(), 0, size)
+            kind = str(dtype).removeprefix("torch.")
+            return torch.from_numpy(np.memmap(file, kind, "w+", shape=(rows, columns)))
     except OSError as error:
-        seen = f"{what} do not fit into a temporary file: {error.strerror}"
+        seen = f"{rows} x {columns} numbers do not fit into a temporary file: {error.strerror}"
         raise InputError(f"{seen}; expected room there, or TMPDIR set to a folder with room") from error
 
 
-def empty(rows: int, columns: int, device: torch.device, in_memory: int = IN_MEMORY) -> Tensor:
-    """Uninitialised (rows,columns) float32; on the CPU, more than `in_memory` bytes are in an unnamed
-    temporary file. InputError if there is no room for it."""
-    size = 4 * rows * columns
-    if device.type != "cpu" or size <= in_memory:
-        return torch.empty(rows, columns, dtype=torch.float32, device=device)
-    with _spilling(f"{rows} x {columns} numbers"), tempfile.TemporaryFile() as file:
-        if hasattr(os, "posix_fallocate"):  # a full disk would end the process later
-            os.posix_fallocate(file.fileno(), 0, size)
-        return torch.from_numpy(np.memmap(file, np.float32, "w+", shape=(rows, columns)))
-
-
-def concatenate(batches: Iterable[Tensor], in_memory: int = IN_MEMORY, half: bool = False) -> Tensor:
-    """Batches (B,D) of one dtype as one tensor (N,D), which may be larger than the memory.
+def concatenate(
+    batches: Iterable[Tensor], rows: int, in_memory: int = IN_MEMORY, half: bool = False
+) -> Tensor:
+    """Batches (B,D) of one dtype, which have so many rows in all, as one tensor, see `empty`.
 
     Args:
-        in_memory: about how many bytes to keep in memory. More spill to an unnamed temporary file, which
-            the tensor then maps, on the CPU: rows are read when they are used.
-        half: whether the file holds float16.
+        in_memory: bytes; more are in a file, on the CPU, also of batches elsewhere.
+        half: whether a file holds float16.
 
     Raises:
-        InputError: batches of different D or dtype, none at all, or no room for the file.
+        InputError: batches of different D or dtype, none at all, or no room for a file.
     """
-    parts: list[Tensor] = []
-    file: IO[bytes] | None = None
-    rows, held = 0, 0
-    for block in _blocks(batches, min(BLOCK_BYTES, in_memory)):
-        parts.append(block)
-        rows, held = rows + len(block), held + block.nbytes
-        if held > in_memory:
-            file = _spilled(parts, file, half)
-            parts, held = [], 0
-    expect(parts or file is not None, "at least one batch", "there are no features")
-    if file is None:
-        if len(parts) == 1:
-            return parts[0]
-        whole = block.new_empty(rows, block.shape[1])  # torch.cat would hold all of them twice
-        for room in whole.split([len(part) for part in parts]):
-            room.copy_(parts.pop(0))
-        return whole
-    _spilled(parts, file, half)
-    dtype = np.float16 if half else block.cpu().numpy().dtype
-    # copy on write: the tensor may be written to, the file never is
-    return torch.from_numpy(np.memmap(file, dtype, "c", shape=(rows, block.shape[1])))
-
-
-def _blocks(batches: Iterable[Tensor], most: int) -> Iterator[Tensor]:
-    """Batches concatenated to blocks of just over `most` bytes."""
-    loose: list[Tensor] = []
-    kind, rows, held = None, 0, 0
+    whole, first = torch.empty(0), 0
     for batch in batches:
-        dimension, dtype = seen = batch.shape[1], batch.dtype
-        kind = kind or seen
+        columns, dtype = batch.shape[1], batch.dtype
+        if not first:
+            whole, kind = _room(rows, batch, in_memory, half), (columns, dtype)
         before = f"{kind[0]} of {kind[1]} as before"
-        expect(seen == kind, before, f"features {rows}.. are {dimension} of {dtype}")
-        rows, held = rows + len(batch), held + batch.nbytes
-        loose.append(batch)
-        if held > most:
-            block, loose, held = torch.cat(loose), [], 0
-            yield block
-    if loose:
-        yield torch.cat(loose)
+        expect(kind == (columns, dtype), before, f"features {first}.. are {columns} of {dtype}")
+        whole[first : first + len(batch)] = batch
+        first += len(batch)
+    expect(first == rows > 0, f"{rows or 'some'}", f"there are {first or 'no'} features")
+    return whole
 
 
-def _spilled(parts: list[Tensor], file: IO[bytes] | None, half: bool) -> IO[bytes]:
-    """The parts appended to the file, or to a new one if there is none."""
-    with _spilling("the features"):
-        file = tempfile.TemporaryFile() if file is None else file  # noqa: SIM115, the tensor keeps it open
-        for part in parts:
-            file.write((part.half() if half else part).cpu().contiguous().numpy().data)
-        file.flush()
-    return file
+def _room(rows: int, like: Tensor, in_memory: int, half: bool) -> Tensor:
+    """Room for rows like those of a tensor."""
+    columns = like.shape[1]
+    if rows * columns * like.itemsize <= in_memory:
+        return torch.empty(rows, columns, dtype=like.dtype, device=like.device)
+    return empty(rows, columns, torch.device("cpu"), 0, torch.float16 if half else like.dtype)

@@ -28,12 +28,12 @@ from dejavu_torch.types import InputError, Traverse, expect
 SURE = 0.9  # probability of a frame that teaches
 FEWEST, SHARE = 60, 0.1  # frames of a drive that teaches, and their share of it, at least
 ROUNDS = 2  # of placing: the second time on a map that the first one taught
-LEAST = 30  # frames of a drive that is placed at all
+SHORTEST = 30  # frames of a drive that is placed at all
 SHRINKAGE = 0.3  # of what a drive changes, when a stage is learned from it
 FOLDS = 4  # stretches of a drive, each asked after a stage that was learned from the others
 APART = 2  # correlation times between a stretch and what teaches its stage
 ERRORS = 1  # standard errors by which places have to rank higher after a new stage
-BLOCK = 2**22  # scores at a time
+SCORES_AT_ONCE = 2**22  # scores at a time
 
 
 @torch.no_grad()
@@ -148,7 +148,7 @@ def described(model: DejaVu, drive: Source, verb: str, progress: bool = False) -
     if not isinstance(place_map, SpectralMap):
         raise InputError(f"the map is of kind {place_map.kind!r}; expected one of kind 'spectral' to {verb}")
     traverse = model.resample(as_traverse(drive), model.step, progress, model.frame_shape)
-    expect(len(traverse) >= LEAST, f"at least {LEAST}", f"{traverse.name} has {len(traverse)} frames")
+    expect(len(traverse) >= SHORTEST, f"at least {SHORTEST}", f"{traverse.name} has {len(traverse)} frames")
     features = model.descriptor.count_features(traverse)
     check_queries(model, traverse.frame_shape, features, traverse.name)
     return traverse, model.descriptor.all_of(traverse, progress).float().to(place_map.device)
@@ -182,7 +182,7 @@ def refined_by(model: DejaVu, descriptors: Tensor) -> Refined:
     before, asked = _log_ranks(place_map, queries, places), []
     for fold in torch.arange(count).tensor_split(FOLDS):
         far = (sure < int(fold[0]) - APART * tau) | (sure > int(fold[-1]) + APART * tau)
-        if int(far.sum()) < LEAST:
+        if int(far.sum()) < SHORTEST:
             return Refined(Refinement(len(sure), count), place_map, calibration)
         refined = place_map.refined(_stage(place_map, queries, places, sure[far]))
         gains[fold] = (before - _log_ranks(refined, queries, places))[fold]
@@ -225,7 +225,7 @@ def _calibration(
 
 
 def _at_once(place_map: PlaceMap) -> int:
-    return max(1, BLOCK // place_map.places)
+    return max(1, SCORES_AT_ONCE // place_map.places)
 
 
 @without_autocast

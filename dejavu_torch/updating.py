@@ -38,7 +38,7 @@ BRANCH = 0.5  # probability of a link from or to a place within a route; from en
 Stretch = tuple[int, int]  # frames [first, last) of a drive
 
 
-class Ground(NamedTuple):
+class NewGround(NamedTuple):
     """What a drive shows of ground that a map lacks: stretches to store, others that may only be hard to
     recognise, and the answers of the map that has the first."""
 
@@ -136,7 +136,7 @@ def update(
     return Update(refinement, True, tuple(stretches), tuple(names), tuple(unknown))
 
 
-def _new_ground(place_map: SpectralMap, queries: Tensor, progress: bool) -> Ground:
+def _new_ground(place_map: SpectralMap, queries: Tensor, progress: bool) -> NewGround:
     """The stretches of a drive that are off the map."""
     least = math.ceil(max(NEWEST, TAUS * spacing_of(queries).correlation))
     new: list[Stretch] = []
@@ -149,7 +149,7 @@ def _new_ground(place_map: SpectralMap, queries: Tensor, progress: bool) -> Grou
         told = bool(unknown) and _recognised(grown, queries, answers.match)
         found = [stretch for stretch in unknown if told or _at_an_end(grown, answers.match, stretch)]
         if not found:
-            return Ground(new, unknown, answers)
+            return NewGround(new, unknown, answers)
         new = _with_piece(new, found[0], least)
 
 

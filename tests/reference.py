@@ -191,33 +191,33 @@ def joined_rows(places, queries, kept, level):
     return (theirs @ ours.T / lengths).float()
 
 
-def transitions(layout, rates):
-    """Probability of each step from one state to another, by walking; see `Layout` for the states."""
-    n, moves = layout.places, rates.moves.tolist()
+def transitions(states, rates):
+    """Probability of each step from one state to another, by walking; see `States`."""
+    n, moves = states.places, rates.moves.tolist()
     jump, leave, enter = (float(rate) for rate in rates[1:])
-    states = layout.directions * n
-    matrix = [[0.0] * (states + 1) for _ in range(states + 1)]
+    count = states.directions * n
+    matrix = [[0.0] * (count + 1) for _ in range(count + 1)]
 
     def number(direction, place):
         return place if direction == 0 else 2 * n - 1 - place
 
     def walks(direction, place):
         """Where one step leads; what is missing leaves the route."""
-        ways = [(a, b, s) if direction == 0 else (b, a, s) for a, b, s in layout.links]
+        ways = [(a, b, s) if direction == 0 else (b, a, s) for a, b, s in states.links]
         linked = [(b, s) for a, b, s in ways if a == place]
         total = sum(s for _, s in linked)
         found = [(b, s / max(1.0, total)) for b, s in linked]
         following = place + 1 if direction == 0 else place - 1
         border = max(place, following)
-        if 0 <= following < n and border not in layout.route_starts[1:]:
+        if 0 <= following < n and border not in states.route_starts[1:]:
             found.append((following, max(0.0, 1 - total)))
         return found
 
-    for direction in range(layout.directions):
+    for direction in range(states.directions):
         for place in range(n):
             row = matrix[number(direction, place)]
-            turned = [(direction, 1 - layout.turn), (1 - direction, layout.turn)][: layout.directions]
-            turned = turned if layout.directions == 2 else [(direction, 1.0)]
+            turned = [(direction, 1 - states.turn), (1 - direction, states.turn)][: states.directions]
+            turned = turned if states.directions == 2 else [(direction, 1.0)]
             for way, share in turned:
                 mass = {place: share}
                 for v, move in enumerate(moves):
@@ -230,13 +230,13 @@ def transitions(layout, rates):
                     stay = (1 - jump - leave) * move
                     for at, amount in mass.items():
                         row[number(way, at)] += stay * amount
-                    row[states] += stay * (share - sum(mass.values()))
-            for j in range(states):
-                row[j] += jump / states
-            row[states] += leave
-    for j in range(states):
-        matrix[states][j] = enter / states
-    matrix[states][states] = 1 - enter
+                    row[count] += stay * (share - sum(mass.values()))
+            for j in range(count):
+                row[j] += jump / count
+            row[count] += leave
+    for j in range(count):
+        matrix[count][j] = enter / count
+    matrix[count][count] = 1 - enter
     return matrix
 
 

@@ -84,7 +84,7 @@ def test_a_part_is_that_of_the_whole_picture(scale, seed, data):
 
 
 def test_a_tiff_is_read_in_parts(geotiff, monkeypatch):
-    monkeypatch.setattr(pictures, "BLOCK", 64)
+    monkeypatch.setattr(pictures, "SIDE_READ", 64)
     monkeypatch.setattr(pictures, "HELD", 3 * 64 * 64 * 4)
     pixels = ground(200, 260)
     path = geotiff(pixels)
@@ -237,7 +237,7 @@ def test_turned_and_misnamed_files_are_read_alike_without_rasterio(geotiff, monk
 
 
 def test_blocks_at_a_border_count_as_whole_ones(monkeypatch):
-    monkeypatch.setattr(pictures, "BLOCK", 64)
+    monkeypatch.setattr(pictures, "SIDE_READ", 64)
     monkeypatch.setattr(pictures, "HELD", 3 * 64 * 64 * 4)
     pixels = ground(65, 640)
     picture = Picture((3, 65, 640), lambda a, b, c, d: pixels[:, a:b, c:d])

@@ -18,7 +18,11 @@ TABLE = Path(__file__).with_name("questions.json")
 WAYS = {"SequenceMatcher", "PlaceFilter", "PlaceSmoother"}
 MAPS = {"SpectralMap", "TemplateMap", "SpectralMapper", "TemplateMapper"}
 NOUNS = {"Area", "PlaceMap", "SequenceModel", "Traverse", "Localizer", "Searcher", *WAYS, *MAPS}
-ASKED = {"area": {"area", "rectangles", "columns", "dimensions"}, "routes": {"routes"}, "maps": {"kind"}}
+ASKED = {  # names of variables and, after a dot, of attributes
+    "area": {"area", "rectangles", ".area", ".rectangles", ".columns", ".dimensions"},
+    "routes": {"routes", ".routes"},
+    "maps": {".kind"},
+}
 MOST = 8  # parameters
 
 
@@ -49,19 +53,19 @@ def conditions(tree):
             yield node.args[0]
 
 
-def words(node):
-    """The last names of what an expression mentions, as `area` of `self.area.rows`."""
+def words(node, dot=""):
+    """Every name that an expression mentions, as `self`, `.area` and `.rows` in `self.area.rows`."""
     for one in ast.walk(node):
         if isinstance(one, ast.Name):
             yield one.id
         elif isinstance(one, ast.Attribute):
-            yield one.attr
+            yield f"{dot}{one.attr}"
 
 
 def questions(tree, kinds):
     """What a file asks, and in which lines: pairs."""
     for condition in conditions(tree):
-        mentioned = {*words(condition)}
+        mentioned = {*words(condition, ".")}
         for question, names in ASKED.items():
             if mentioned & names:
                 yield question, condition.lineno
@@ -151,6 +155,7 @@ def test_nobody_asks_more_than_before():
         ("def __init__(a, b, c, d, e, f, g, h, *, i): pass", None),
         ("self.area = area", None),
         ("if rows: x = area", None),
+        ("if columns: pass", None),
         ("isinstance(x, str)", None),
         ("def f(area: Area, count: int | None = None): pass", None),
     ],

@@ -26,7 +26,10 @@ from dejavu_torch.types import Facts, InputError
 
 log = logging.getLogger("dejavu_torch")
 
-BLOCK, HELD = 512, 2**27  # pixels of the file to a side that are read together; bytes of them that are kept
+SIDE_READ, HELD = (
+    512,
+    2**27,
+)  # pixels of the file to a side that are read together; bytes of them that are kept
 BYTES_PER_PIXEL = 8.0  # peak while a picture is decoded whole
 TIFF, ORIENTATION, GEOREFERENCED = {".tif", ".tiff"}, 274, {33550, 34264}  # tags; size of a pixel, a matrix
 
@@ -40,8 +43,8 @@ class Picture:
         shape: (C,H,W) of the file. read: (top, bottom, left, right) -> its pixels (C,h,w) uint8. scale: of
             its sides, at most 1.
 
-    Convention: reduced as by `resize_frames`, equally whichever part is read. About `BLOCK` x `BLOCK` pixels
-        of the file are read together; the last ones are kept.
+    Convention: reduced as by `resize_frames`, equally whichever part is read. About `SIDE_READ` pixels of the
+        file to a side are read together; the last ones are kept.
     """
 
     ndim, dtype = 3, torch.uint8
@@ -51,7 +54,7 @@ class Picture:
         self.full = [max(1, round(scale * side)) for side in self.size]
         self.factor = [one / other for one, other in zip(self.size, self.full, strict=True)]
         self.shape, self.corner = torch.Size((shape[0], *self.full)), (0, 0)
-        self.side, self.read = max(8, round(BLOCK * scale)), read
+        self.side, self.read = max(8, round(SIDE_READ * scale)), read
         self._blocks: dict[tuple[int, int], Tensor] = {}
 
     def __getstate__(self) -> Facts:

@@ -23,7 +23,7 @@ from dejavu_torch.types import Coordinates, InputError, Traverse, expect
 log = logging.getLogger("dejavu_torch")
 
 
-KEPT = 2**27  # bytes of the frames that are kept of a traverse
+KEPT_BYTES = 2**27  # bytes of the frames that are kept of a traverse
 PARTS = "rows=first:stop, columns=first:stop"  # of the picture of an area
 KEPT_FRAMES = 10_000  # longer traverses are read in parts, and again
 
@@ -231,11 +231,11 @@ class Whole(Part):
 
 
 class Kept(Part):
-    """Frames that are read once: the first ones are held, up to `KEPT` bytes."""
+    """Frames that are read once: the first ones are held, up to `KEPT_BYTES` bytes."""
 
     def __init__(self, traverse: Traverse) -> None:
         super().__init__(traverse, range(len(traverse)))
-        held = min(len(self), KEPT // (4 * math.prod(self.frame_shape)))
+        held = min(len(self), KEPT_BYTES // (4 * math.prod(self.frame_shape)))
         # of which a system gives only what is written to
         self.values = torch.empty(held, *self.frame_shape, dtype=torch.float32)
         self.known = torch.zeros(len(self), dtype=torch.bool)

@@ -87,7 +87,8 @@ def null_map(
 def shuffled(reference: Tensor, seed: int = 0) -> tuple[Tensor, Tensor]:
     """A random order (N,), and the descriptors (N,D) in it."""
     order = torch.randperm(len(reference), generator=torch.Generator().manual_seed(seed))
-    return order, concatenate(reference[part] for part in order.to(reference.device).split(256))
+    rows = (reference[part] for part in order.to(reference.device).split(256))
+    return order, concatenate(rows, len(order))
 
 
 def _same_layers(place_map: TemplateMap, features: Tensor) -> TemplateMap:

@@ -8,7 +8,7 @@ from torch import Tensor
 CENTROIDS = 256  # of one byte
 ROUNDS = 25
 TRAINED = 256 * CENTROIDS  # descriptors that centroids are learned from, at most
-BLOCK = 2**22  # distances computed at a time
+DISTANCES_AT_ONCE = 2**22  # distances computed at a time
 
 
 def product_quantised(
@@ -58,5 +58,5 @@ def k_means(points: Tensor, count: int, draw: torch.Generator) -> Tensor:
 def _nearest(points: Tensor, centroids: Tensor) -> Tensor:
     """The nearest centroid of each point, (N,) int64."""
     half = centroids.square().sum(1) / 2
-    parts = points.split(max(1, BLOCK // len(centroids)))
+    parts = points.split(max(1, DISTANCES_AT_ONCE // len(centroids)))
     return torch.cat([(half - part @ centroids.T).argmin(1) for part in parts])

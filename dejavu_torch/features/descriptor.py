@@ -136,7 +136,7 @@ class Descriptor(nn.Module):
             return self._set_aside(batches, traverse) if id(traverse) in self.aside else batches
         key = traverse.name if isinstance(traverse, AugmentedFrames) else id(traverse)
         if key not in self.known:
-            features = concatenate(feature_batches(traverse, self, size, *settings))
+            features = concatenate(feature_batches(traverse, self, size, *settings), len(traverse))
             self.known[key] = traverse, features  # which keeps its id
         return (part.to(self.device) for part in self.known[key][1].split(ROWS))
 
@@ -220,7 +220,8 @@ class Descriptor(nn.Module):
 
     def all_of(self, traverse: Traverse, progress: bool = False, on_first: OnFirst | None = None) -> Tensor:
         """Descriptors (N,K) of a whole traverse; many are kept in a temporary file, see `concatenate`."""
-        return concatenate(self.batches(traverse, progress, f"describing {traverse.name}", on_first))
+        batches = self.batches(traverse, progress, f"describing {traverse.name}", on_first)
+        return concatenate(batches, len(traverse))
 
     def learn(
         self,
@@ -260,17 +261,19 @@ class Descriptor(nn.Module):
             whitening = self.whitening
             if whitening is not None and not whitening.fixed:
                 if not (spectral and self._exceeds_memory(traverse)):
-                    features = concatenate(self.features_in(traverse, progress, verb, check_first, True))
+                    batches = self.features_in(traverse, progress, verb, check_first, True)
+                    features = concatenate(batches, len(traverse))
                     if self._mostly_blank(features, traverse):
                         return self.learn(*again)
                     self._learn_whitening(whitening, features, traverse, second, progress)
                     parts = features.split(ROWS)
-                    return concatenate(self.whitened(part.to(self.device)) for part in parts)
+                    return concatenate((self.whitened(part.to(self.device)) for part in parts), len(features))
                 sample = Sample.of(len(traverse), SAMPLE)
                 views = second and sample.views(second)
                 self.learn(Part(traverse, sample.frame), views, progress, verb="sampling")
             storage = (DESCRIPTOR_MEMORY, self.whitening is not None) if spectral else ()
-            rows = concatenate(self.batches(traverse, progress, verb, check_first, True), *storage)
+            batches = self.batches(traverse, progress, verb, check_first, True)
+            rows = concatenate(batches, len(traverse), *storage)
             return self.learn(*again) if self._mostly_blank(rows, traverse) else rows
 
     def _mostly_blank(self, rows: Tensor, traverse: Traverse) -> bool:

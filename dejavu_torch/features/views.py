@@ -20,13 +20,13 @@ SAMPLE = 10_000  # frames that a longer route is fitted on
 OF_AREA, LARGE = 2**14, 2**15  # windows likewise, of an area of more than so many
 TILES = 4  # of an area that the step is chosen in
 MIN_SEGMENTS = 4  # of a sample
-BLOCK = 64  # frames augmented together
+FRAMES_AT_ONCE = 64  # frames augmented together
 SEGMENT, EVERY = 20, 10  # frames of a segment; every 10th segment is used
 STRONGER = 1.5  # factor on the strengths for whitening, which has seen the frames themselves
 FEWEST, MOST = 600, 1200  # frames of all segments together
 MAX_COPIES = 2  # frames of all segments, relative to the frames of a short route
 FITTED = 200  # frames that a line is fitted to
-LEAST, SCORES = 240, 2**27  # frames of a long route at least; their scores at all places at most
+FEWEST_FRAMES, SCORES = 240, 2**27  # frames of a long route at least; their scores at all places at most
 
 
 class Sample(NamedTuple):
@@ -236,7 +236,9 @@ def augmented_route(
 ) -> tuple[LabelledFrames, str]:
     """At most `most` augmented copies of N `frames`, evenly drawn, and a phrase for the log about them."""
     shown = range(0, frames, max(1, -(-frames * copies // most)))
-    views = AugmentedFrames(traverse, [shown], traverse.at_once(BLOCK), copies, strengths, seed, span=span)
+    views = AugmentedFrames(
+        traverse, [shown], traverse.at_once(FRAMES_AT_ONCE), copies, strengths, seed, span=span
+    )
     each = "each frame" if shown.step == 1 else f"{len(shown)} of the frames"
     return LabelledFrames(cast(Traverse, views), views.places), f"{copies} look{'s' * (copies > 1)} at {each}"
 
@@ -261,7 +263,7 @@ def augmented_segments(
     """
     length = min(SEGMENT, max(1, frames // EVERY)) if starts is None else SEGMENT
     starts = range(0, frames - length + 1, EVERY * length) if starts is None else starts
-    most = min(MOST, max(LEAST, SCORES // (places or frames)))
+    most = min(MOST, max(FEWEST_FRAMES, SCORES // (places or frames)))
     runs = [range(start, start + length) for start in starts[:: max(1, -(-len(starts) * length // most))]]
     copies = max(1, -(-min(FEWEST, MAX_COPIES * frames, most) // (len(runs) * length)))
     return AugmentedFrames(traverse, runs, length, copies, strengths, factor=STRONGER, span=span)

@@ -38,7 +38,7 @@ PRIOR = (2, 1)  # initial counts of 0s and 1s in a context; each bit adds 2
 CODED_LEVELS, COUNTED_LEVELS = 2**13, 2**16  # per block
 BIT_BYTES = 5  # at most
 SPAN, MIN_SPAN = 56, 48  # bits of the interval: initial and minimal
-LEAST = 1 << MIN_SPAN
+SMALLEST = 1 << MIN_SPAN
 WORTH_COMPILING = 2**19  # levels that Python codes in the time that numba takes to load
 
 
@@ -58,7 +58,9 @@ def encode(levels: Tensor) -> Stream:
     packed = bytearray()
     _, row, (low, _, size) = _run(numbers, packed)
     packed[size:] = bytes(1)
-    _put(int(low) + LEAST - 1, size, packed)  # the first byte of a number in the interval; the others are 0
+    _put(
+        int(low) + SMALLEST - 1, size, packed
+    )  # the first byte of a number in the interval; the others are 0
     _check_size(row, numbers.shape[1], len(packed))
     return Stream(torch.frombuffer(packed, dtype=torch.uint8), _checksum(numbers))
 
@@ -229,7 +231,7 @@ def _bit(
         span -= part
     else:
         span = part
-    while span < LEAST:
+    while span < SMALLEST:
         span <<= 8
         low = (low << 8 | (packed[at] if at < len(packed) else 0)) if reads else _put(low, at, packed)
         at += 1
@@ -247,7 +249,7 @@ def _put(low: int, at: int, packed: bytearray | Ints) -> int:
             last -= 1
         packed[last] += 1
     packed[at] = byte & 255
-    return (low & LEAST - 1) << 8
+    return (low & SMALLEST - 1) << 8
 
 
 def _near(sums: Ints, rows: Ints, logarithms: Ints) -> Any:

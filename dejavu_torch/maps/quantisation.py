@@ -18,9 +18,9 @@ from dejavu_torch.memory import empty
 ROUNDING = 0.35  # added before rounding down: a dead zone of 1.3 steps around 0
 FINEST = 64  # steps per RMS line: a finer step changes no score
 HALVINGS = 14  # of the range of steps, to 0.1 % of a step
-BLOCK = 2**23  # numbers at a time
+NUMBERS_AT_ONCE = 2**23  # numbers at a time
 SMALL = 0.05  # share of the mean square of descriptors, below which the mean is cheaper as line 0
-CLOSE = 0.995  # of the budget: ends the search of a step for more than BLOCK numbers
+CLOSE = 0.995  # of the budget: ends the search of a step for more than NUMBERS_AT_ONCE numbers
 
 
 @torch.no_grad()
@@ -67,7 +67,7 @@ class RouteLines:
     ) -> None:
         places, dimension = features.shape
         self.mean_energy = 0.0  # of a mean among the lines
-        self.rows = max(1, BLOCK // dimension)
+        self.rows = max(1, NUMBERS_AT_ONCE // dimension)
         if mean is None:
             sums, power = features.new_zeros(dimension, dtype=torch.float64), 0.0
             for part in features.split(self.rows):
@@ -80,7 +80,7 @@ class RouteLines:
         self.chunks = [*pairwise(accumulate((rows * columns for rows, columns in sizes), initial=0))]
         self.lines = empty(places, dimension, features.device)
         for (start, stop), (_, width) in zip(self.chunks, sizes, strict=True):
-            for some in torch.arange(dimension).split(max(1, BLOCK // (stop - start))):
+            for some in torch.arange(dimension).split(max(1, NUMBERS_AT_ONCE // (stop - start))):
                 columns = slice(int(some[0]), int(some[-1]) + 1)
                 part = features[start:stop, columns].float() - mean[columns].float()
                 self.lines[start:stop, columns] = lines_of(part.T, width, transform).T
@@ -112,7 +112,7 @@ class RouteLines:
 
     def step_of(self, room: float) -> float:
         """The smallest step with which the lines fit into `room` bytes; approximate for a long route."""
-        return self._bisect(self.coded_bytes, room, CLOSE if self.lines.numel() > BLOCK else 1.0)[1]
+        return self._bisect(self.coded_bytes, room, CLOSE if self.lines.numel() > NUMBERS_AT_ONCE else 1.0)[1]
 
     def step_that_holds(self, share: float) -> float:
         """The largest step with which the lines hold a share of the variance, or the finest step."""

@@ -30,7 +30,7 @@ AGREE = 0.5  # of what differs between places, between two visits to one
 MIN_NORM = 1e-6  # of the RMS norm in a chunk, or of the mean's norm: shorter descriptors count as 0
 STRONGEST = 10  # periods in a summary
 LARGEST = 2**31 - 1  # places of a map, or its coefficients, for int32
-BLOCK = 2**19  # numbers computed at a time, to stay in the processor's cache
+NUMBERS_AT_ONCE = 2**19  # numbers computed at a time, to stay in the processor's cache
 LONG = 2**22  # numbers of a long chunk computed at a time
 TOGETHER = 16  # queries multiplied with lines at a time, at least
 COPIES = 4  # numbers per place and query: line, transform, score, comparison with the best
@@ -483,7 +483,7 @@ class SpectralMap(PlaceMap):
         parts = [queries]
         if not torch.compiler.is_compiling():  # fewer queries at a time stay in the cache
             places = self.chunks[chunks.stop - 1][1] - self.chunks[chunks.start][0]
-            parts = [*queries.split(max(TOGETHER, BLOCK // places))]
+            parts = [*queries.split(max(TOGETHER, NUMBERS_AT_ONCE // places))]
         with torch.autocast(queries.device.type, enabled=False):
             products = [self._products(part, chunks) for part in parts]
         return products[0] if len(products) == 1 else torch.cat(products)
@@ -510,11 +510,11 @@ class SpectralMap(PlaceMap):
         return from_slots(lines, length, self.transform).flatten(1)
 
     def _runs(self, rows: int) -> Iterator[range]:
-        """Consecutive chunks of equal size, with at most `BLOCK` numbers in this many rows."""
+        """Consecutive chunks of equal size, with at most `NUMBERS_AT_ONCE` numbers in this many rows."""
         first = 0
         while first < len(self.chunks):
             start, stop = self.chunks[first]
-            most = min(len(self.chunks), first + max(1, BLOCK // (rows * (stop - start))))
+            most = min(len(self.chunks), first + max(1, NUMBERS_AT_ONCE // (rows * (stop - start))))
             end = first + 1
             size = self.size_of(first)
             while end < most and self.size_of(end) == size:
@@ -547,7 +547,7 @@ class SpectralMap(PlaceMap):
     @property
     def block_places(self) -> int:
         longest = max((stop - start for start, stop in self.chunks), default=1)
-        return max(COPIES * longest, BLOCK // max(1, self.dimension))
+        return max(COPIES * longest, NUMBERS_AT_ONCE // max(1, self.dimension))
 
     def settings(self) -> Facts:
         return {name: getattr(self, name) for name in ("metric", "transform", "chunk", "resolution")}
@@ -709,7 +709,7 @@ def _rows(counts: Tensor, total: int) -> Tensor:
 def _nonzero(levels: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """counts (W,), feature (L,) and level (L,) of levels (W,K)."""
     width, parts = levels.shape[1], []
-    for rows in levels.split(max(1, BLOCK // width)):
+    for rows in levels.split(max(1, NUMBERS_AT_ONCE // width)):
         nonzero = rows != 0
         counts = nonzero.sum(1).to(_dtype_for(width))
         parts.append((counts, nonzero.nonzero()[:, 1].to(_dtype_for(width - 1)), rows[nonzero]))

@@ -15,7 +15,7 @@ from torch.nn.parameter import is_lazy
 BITS = (8, 32)
 LARGEST = 127  # of the integers
 HUGE = 1e38  # larger weights, which could round to infinity, keep 32 bits
-LEAST = torch.finfo(torch.bfloat16).smallest_normal  # scale; a channel below it is 0
+SMALLEST_SCALE = torch.finfo(torch.bfloat16).smallest_normal  # scale; a channel below it is 0
 SCALE = ".scale"  # appended to the name of a weight; torch allows no dot in the name of a tensor
 
 
@@ -31,7 +31,7 @@ def quantised(weight: Tensor) -> tuple[Tensor, Tensor]:
         ([[127, -50], [0, 0]], [0.02, 0.0])
     """
     scale = (weight.abs().flatten(1).amax(1) / LARGEST).bfloat16()
-    scale = scale.where(scale >= LEAST, 0.0)
+    scale = scale.where(scale >= SMALLEST_SCALE, 0.0)
     steps = scale.where(scale > 0, torch.inf)
     return (weight / _broadcast(steps, weight)).round().to(torch.int8), scale
 

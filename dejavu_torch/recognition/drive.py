@@ -17,7 +17,7 @@ from dejavu_torch.recognition.evidence import Spacing, spacing_of
 from dejavu_torch.recognition.filter import near_scores
 from dejavu_torch.recognition.flight import place_flight
 from dejavu_torch.recognition.large import TILE, LargeDrive, Tiles, is_large
-from dejavu_torch.recognition.motion import Layout
+from dejavu_torch.recognition.motion import States
 from dejavu_torch.recognition.plane import SHARP, near_in_plane
 from dejavu_torch.recognition.select import best_candidates
 from dejavu_torch.recognition.smoother import (
@@ -33,7 +33,7 @@ from dejavu_torch.text import progress_of
 from dejavu_torch.types import Match
 
 DOUBT = 0.1  # nats for each deviation by which an answer's own score is worse than is usual in the drive
-KEPT = 2**26  # scores of drives that are smoothed together, up to which they are computed once
+SCORES_KEPT = 2**26  # scores of drives that are smoothed together, up to which they are computed once
 NORMAL = 1.4826  # standard deviations of a Gaussian over its median absolute deviation
 
 
@@ -207,7 +207,7 @@ def _seen(
     fitted_one: called with 1 for each drive, when its smoother is fitted.
     """
     spacings: dict[int, Spacing] = {}  # of descriptors that several drives share
-    fitted: dict[tuple[int, Layout, int], list[tuple[int, Drive]]] = {}
+    fitted: dict[tuple[int, States, int], list[tuple[int, Drive]]] = {}
     for i, (asked, places) in enumerate(zip(drives, sizes, strict=True)):
         rows, descriptors, smoother, _, _, starts, *_ = asked
         if smoother.area is not None:
@@ -226,10 +226,10 @@ def _seen(
         smoother.fit(rows, descriptors, starts, spacing)
         asked.ask_singly(spacing)
         fitted_one(1)
-        kind = len(descriptors), smoother.layout(places, starts), len(smoother.move_logits)
+        kind = len(descriptors), smoother.states(places, starts), len(smoother.move_logits)
         fitted.setdefault(kind, []).append((i, smoother.drive(rows, descriptors, spacing)))
-    for (queries, layout, _), alike in fitted.items():
-        every = len(alike) * queries * layout.places <= KEPT
+    for (queries, states, _), alike in fitted.items():
+        every = len(alike) * queries * states.places <= SCORES_KEPT
         alike = [(i, drive._replace(rows=_kept(drive.rows, every))) for i, drive in alike]
         pairs = [(drives[i].smoother, drive) for i, drive in alike]
         for block in blocks_together(pairs, drives[alike[0][0]].route_starts):

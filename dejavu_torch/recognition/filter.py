@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from dejavu_torch.area import Area
 from dejavu_torch.memory import is_plain, without_autocast
-from dejavu_torch.recognition.motion import MIN_PROBABILITY, Layout, Motion, Rates, checked_rates, logits
+from dejavu_torch.recognition.motion import MIN_PROBABILITY, Motion, Rates, States, checked_rates, logits
 from dejavu_torch.recognition.online import Learned
 from dejavu_torch.recognition.plane import SHARP, Followed, PlaneMotion, near_in_plane
 from dejavu_torch.recognition.sequence import each
@@ -298,7 +298,7 @@ class PlaceFilter(SequenceModel):
         rates = Rates(moves, jump, leave, self.enter_logit.to(like).sigmoid())
         if self.area is not None:
             return PlaneMotion(self.area, rates)
-        return Motion(Layout(like.shape[-1], route_starts=tuple(route_starts)), rates)
+        return Motion(States(like.shape[-1], route_starts=tuple(route_starts)), rates)
 
     def check(self, queries: int | None, places: int) -> None:
         seen = f"a lag of {self.lag} where all queries are known"

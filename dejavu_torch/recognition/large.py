@@ -21,13 +21,13 @@ from dejavu_torch.recognition.evidence import (
 from dejavu_torch.recognition.motion import Motion
 from dejavu_torch.recognition.smoother import (
     CORRELATED,
+    FEWEST_FITTED,
     FITTED,
-    LEAST,
     SAMPLED,
     STRETCH,
     STRETCHES,
+    FittedPart,
     PlaceSmoother,
-    Sample,
 )
 from dejavu_torch.text import progress_of
 
@@ -51,7 +51,7 @@ class Tiles(NamedTuple):
 
 def is_large(queries: int, places: int) -> bool:
     """Whether a drive goes coarse to fine."""
-    return queries > LEAST and (places > LARGE_MAP or queries * places > LARGE)
+    return queries > FEWEST_FITTED and (places > LARGE_MAP or queries * places > LARGE)
 
 
 class Window(NamedTuple):
@@ -94,7 +94,7 @@ class LargeDrive:
         self.group = GROUP
         while self.queries * places > self.group * HELD:
             self.group *= 2
-        self.layout = smoother.layout(places, route_starts)
+        self.states = smoother.states(places, route_starts)
         self.means = self._means()
         self.mean, self.spread, self.speaks = torch.zeros(3, self.queries)
         best = self._pooled()
@@ -164,7 +164,7 @@ class LargeDrive:
         """The windows of a drive, with the places that a smoother of groups leaves."""
         size, fine = self.group, self.smoother
         speed = sum(move * share for move, share in enumerate(fine.prior)) / size
-        links = [(one // size, two // size, share / 2) for one, two, share in self.layout.links]
+        links = [(one // size, two // size, share / 2) for one, two, share in self.states.links]
         coarse = PlaceSmoother((1 - speed, speed), turn=fine.turn, links=links)
         starts = sorted({start // size for start in self.route_starts})
 
@@ -231,7 +231,7 @@ class LargeDrive:
         length, windows = max(STRETCH, math.ceil(CORRELATED * self.spacing.correlation)), self.windows
         count = max(1, min(STRETCHES, FITTED // length, len(windows)))
         chosen = torch.linspace(0, len(windows) - 1, count).round().int().tolist()
-        most = [max(LEAST, SAMPLED // (count * max(1, len(windows[i].places)))) for i in chosen]
+        most = [max(FEWEST_FITTED, SAMPLED // (count * max(1, len(windows[i].places)))) for i in chosen]
         lengths = [min(FITTED // count, windows[i].last - windows[i].first) for i in chosen]
         return {i: min(pair) for i, *pair in zip(chosen, most, lengths, strict=True)}
 
@@ -247,11 +247,11 @@ class LargeDrive:
         self.smoother.means = self.means
         self.smoother.learn(samples, ranks, self.spacing)
 
-    def _sample(self, window: Window, some: slice) -> Sample:
+    def _sample(self, window: Window, some: slice) -> FittedPart:
         z = window.z[some.start - window.start : some.stop - window.start].float()
-        speaks, layout = self.speaks[some] > 0, self.layout.of(window.places)
+        speaks, states = self.speaks[some] > 0, self.states.of(window.places)
         std = Standardised(z.nan_to_num(0, 0, 0), speaks, z.isfinite() | ~speaks[:, None])
-        return Sample(std, self.spacing.weight[some], self.spacing.still[some], layout)
+        return FittedPart(std, self.spacing.weight[some], self.spacing.still[some], states)
 
     @torch.no_grad()
     def __iter__(self) -> Iterator[tuple[int, Tensor, Tensor, Tensor]]:
@@ -261,7 +261,7 @@ class LargeDrive:
         rates = smoother.rates(self.means)
         for window in self.windows[::-1]:
             sample = self._sample(window, slice(window.start, window.stop))
-            model = smoother.values, smoother.separation, Motion(sample.layout, rates)
+            model = smoother.values, smoother.separation, Motion(sample.states, rates)
             (block,) = smoother.explained(sample, *model, len(sample.weight))
             own = slice(window.first - window.start, window.last - window.start)
             z = window.z[own].float() * self.spread[window.first : window.last, None]

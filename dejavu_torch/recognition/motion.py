@@ -35,7 +35,7 @@ class Counts(NamedTuple):
     absent: Tensor
 
 
-class Layout(NamedTuple):
+class States(NamedTuple):
     """The states of a route: its N places in D directions of travel, and being off the map.
 
     A belief is (..., D N + 1): the places in order; with D = 2 the places once more, from the last to the
@@ -56,14 +56,14 @@ class Layout(NamedTuple):
     turn: float = 0.0
     share: float = 1.0
 
-    def of(self, places: Tensor) -> Layout:
-        """The layout of some places (n,) in order; moves end at each gap."""
+    def of(self, places: Tensor) -> States:
+        """The states of some places (n,) in order; moves end at each gap."""
         starts = torch.isin(places, torch.tensor(self.route_starts))
         starts |= F.pad(places[1:] != places[:-1] + 1, (1, 0), value=True)
         at = {place: i for i, place in enumerate(places.tolist())} if self.links else {}
         links = tuple((at[one], at[two], share) for one, two, share in self.links if {one, two} <= at.keys())
         routes, share = tuple(starts.nonzero()[:, 0].tolist()), len(places) / self.places
-        return Layout(len(places), self.directions, routes, links, self.turn, share)
+        return States(len(places), self.directions, routes, links, self.turn, share)
 
 
 class Motion:
@@ -75,24 +75,24 @@ class Motion:
     Rates of several drives (C,) go with beliefs (C,S); `best_moved` and `counts` take those of one.
     """
 
-    def __init__(self, layout: Layout, rates: Rates) -> None:
-        self.layout, self.rates = layout, rates
+    def __init__(self, states: States, rates: Rates) -> None:
+        self.states, self.rates = states, rates
         _, jump, leave, enter = rates
-        self.each = layout.share / max(1, layout.directions * layout.places)
+        self.each = states.share / max(1, states.directions * states.places)
         self.moves = ((1 - jump - leave)[..., None] * rates.moves)[..., None, None].unbind(-3)
-        last, taken = layout.places - 1, rates.moves.new_zeros(layout.directions, layout.places)
+        last, taken = states.places - 1, rates.moves.new_zeros(states.directions, states.places)
         ways: list[tuple[int, int, int, float]] = []
-        for first, second, share in layout.links:
-            both = [(first, second), (last - second, last - first)][: layout.directions]
+        for first, second, share in states.links:
+            both = [(first, second), (last - second, last - first)][: states.directions]
             ways += [(row, at, to, share) for row, (at, to) in enumerate(both)]
         for row, at, _, share in ways:
             taken[row, at] += share
         self.linked = [(row, at, to, share / max(1.0, float(taken[row, at]))) for row, at, to, share in ways]
         keep = 1 - F.pad(taken[:, :-1].clamp(max=1), (1, 0))
-        for start in layout.route_starts[1:]:
+        for start in states.route_starts[1:]:
             keep[0, start] = 0
             keep[1:, last + 1 - start] = 0
-        plain = len(layout.route_starts) == 1 and not layout.links
+        plain = len(states.route_starts) == 1 and not states.links
         self.keep = None if plain else keep  # the share of a place's mass that moves on to the next one
         # the share of a move by 0, 1, .. V places that stays on the route
         self.reach = [*self._shifts(torch.ones_like(keep), back=True)]
@@ -101,7 +101,7 @@ class Motion:
         jump, leave, enter = (rate[..., None] for rate in (jump, leave, enter))
         self.free = torch.cat([jump.expand(*jump.shape[:-1], keep.numel()), enter], -1)
         left = torch.cat([self._turned(self.lost).flatten(-2) + leave, 1 - enter], -1)
-        self.gone = left + (1 - layout.share) * self.free
+        self.gone = left + (1 - states.share) * self.free
 
     def _shifted(self, on: Tensor) -> Tensor:
         """Mass (..., D, N) one place further."""
@@ -146,13 +146,13 @@ class Motion:
 
     def _turned(self, on: Tensor) -> Tensor:
         """Mass (..., D, N), some of it in the other direction; its own transpose."""
-        if self.layout.directions == 1:
+        if self.states.directions == 1:
             return on
-        return torch.lerp(on, on.flip(-1, -2), self.layout.turn)
+        return torch.lerp(on, on.flip(-1, -2), self.states.turn)
 
     def _split(self, state: Tensor) -> tuple[Tensor, Tensor]:
         """The places (..., D, N), and being off the map (..., 1)."""
-        return state[..., :-1].unflatten(-1, (self.layout.directions, -1)), state[..., -1:]
+        return state[..., :-1].unflatten(-1, (self.states.directions, -1)), state[..., -1:]
 
     @staticmethod
     def _share(belief: Tensor, goes: Tensor) -> Tensor:
@@ -178,7 +178,7 @@ class Motion:
         on, off = self._split(log)
         _, jump, _, enter = self.rates
         anywhere = jump * self.each
-        turn = self.layout.turn if self.layout.directions == 2 else 0.0
+        turn = self.states.turn if self.states.directions == 2 else 0.0
         best = torch.full_like(on, -math.inf)
         for move in self.moves[::-1]:
             best = self._best_shifted(best)
@@ -205,8 +205,8 @@ class Motion:
         both = (self.rates.leave + self.rates.enter).clamp(min=MIN_PROBABILITY)
         off = (self.rates.leave / both).clamp(max=0.5)
         on = 1 - off[..., None]
-        places = self.layout.directions * self.layout.places
-        return torch.cat([(on * self.each).expand(*off.shape, places), 1 - on * self.layout.share], -1)
+        places = self.states.directions * self.states.places
+        return torch.cat([(on * self.each).expand(*off.shape, places), 1 - on * self.states.share], -1)
 
     def counts(self, before: Tensor, after: Tensor) -> Counts:
         """Expected numbers of steps (the E-step of Baum and Welch).
@@ -218,7 +218,7 @@ class Motion:
         (on, off), (on_after, off_after) = self._split(before), self._split(after)
         start, off, off_after = self._turned(on), off[..., 0], off_after[..., 0]
         total = before[..., :-1].sum(-1)
-        mean = torch.lerp(off_after, after[..., :-1].mean(-1), self.layout.share)
+        mean = torch.lerp(off_after, after[..., :-1].mean(-1), self.states.share)
         _, jump, leave, enter = self.rates
         kinds = []
         shifts = self._shifts(on_after, back=True)

@@ -8,9 +8,9 @@ import torch
 from torch import Tensor
 from typing_extensions import Self
 
-BLOCK = 25  # queries, whose mean varies by as much as they depend on each other
+MEAN_OF = 25  # queries, whose mean varies by as much as they depend on each other
 PRIOR, MOVE_PRIOR = 100.0, 50.0  # queries that the given sharpness, and the given moves, count as
-LEAST = 0.3  # mean z of right places
+LEAST_MEAN = 0.3  # mean z of right places
 MIN_VARIANCE = 1e-6
 
 
@@ -46,8 +46,8 @@ class Learned(NamedTuple):
         speaks = speaks.to(z)
         queries, squares, mean, mass = self.numbers.unbind()
         queries, block = queries + speaks, self.block + speaks * z
-        full = (queries.remainder(BLOCK) == 0) * speaks
-        squares = squares + full * (block / BLOCK).square().mean()
+        full = (queries.remainder(MEAN_OF) == 0) * speaks
+        squares = squares + full * (block / MEAN_OF).square().mean()
         mean, mass = mean + speaks * (expected * z).sum(), mass + speaks * expected.sum()
         numbers = torch.stack([queries, squares, mean, mass])
         return Learned(self.total + full * block, (1 - full) * block, numbers, self.moves + moves)
@@ -60,13 +60,13 @@ class Learned(NamedTuple):
         The off-map state is half as far out as a right place, where Gaussian likelihoods are equal.
         """
         queries, squares, total, mass = self.numbers.unbind()
-        given = (2 * off_map).clamp(min=LEAST)
-        mu = ((PRIOR * given + total) / (PRIOR + mass)).clamp(min=LEAST)
-        blocks = (queries / BLOCK).floor()
-        common = (self.total / (blocks * BLOCK).clamp(min=1)).square().mean()
+        given = (2 * off_map).clamp(min=LEAST_MEAN)
+        mu = ((PRIOR * given + total) / (PRIOR + mass)).clamp(min=LEAST_MEAN)
+        blocks = (queries / MEAN_OF).floor()
+        common = (self.total / (blocks * MEAN_OF).clamp(min=1)).square().mean()
         between = (squares / blocks.clamp(min=1) - common) * blocks / (blocks - 1).clamp(min=1)
-        tau = (BLOCK * between / (1 - common).clamp(min=MIN_VARIANCE)).clamp(min=1)
-        weight = torch.where(blocks > 1, blocks * BLOCK, 0)
+        tau = (MEAN_OF * between / (1 - common).clamp(min=MIN_VARIANCE)).clamp(min=1)
+        weight = torch.where(blocks > 1, blocks * MEAN_OF, 0)
         tau = (PRIOR * given / sharpness + weight * tau) / (PRIOR + weight)
         return (sharpness * mu / tau).sqrt(), torch.where(mass > 0, mu / 2, off_map)
 

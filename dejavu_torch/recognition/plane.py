@@ -13,7 +13,7 @@ from dejavu_torch.area import Area
 from dejavu_torch.recognition.motion import MIN_PROBABILITY, Counts, Rates
 
 SHARP = 2  # windows around a place whose mass an answer is chosen by
-KEPT = 0.95  # of learned moves from one query to the next
+PERSISTENCE = 0.95  # of learned moves from one query to the next
 MOVES_GIVEN = 5.0  # queries that the given moves count as
 
 
@@ -85,7 +85,7 @@ class Followed(NamedTuple):
 
     def after(self, z: Tensor, speaks: Tensor, expected: Tensor, moves: Tensor) -> Followed:
         """The numbers after another query, see `Learned`."""
-        return Followed(KEPT * self.moves + moves)
+        return Followed(PERSISTENCE * self.moves + moves)
 
     def likelihood(self, sharpness: Tensor, off_map: Tensor) -> tuple[Tensor, Tensor]:
         """Both as given."""

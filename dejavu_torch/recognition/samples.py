@@ -22,7 +22,7 @@ REFINED = 16  # best groups of a query, of which all places are scored
 LEVELS = 127  # steps on each side of 0
 FINER = 254  # parts of a step
 DOUBT = 5 / math.sqrt(12)  # steps, as five standard deviations of what rounding to whole ones changes
-BLOCK, PRODUCTS = 8192, 2**20  # samples, and products with them, at a time: these stay in the cache
+SAMPLES_AT_ONCE, PRODUCTS = 8192, 2**20  # samples, and products with them, at a time: these stay in the cache
 GATHERED = 2**18  # numbers of samples that are compared at a time
 LARGER = 2**7  # times as many at a time on a device
 WIDEST = 2**14  # numbers of a descriptor: `GROUP` x products are below 2**31
@@ -166,7 +166,7 @@ def products_of(rows: Tensor, queries: Tensor) -> Iterator[Tensor]:
     queries = padded(queries, rows.shape[1])
     int8 = has_int8_products(device)
     if not int8:
-        yield from ((part.float() @ queries.T.float()).int() for part in rows.split(BLOCK))
+        yield from ((part.float() @ queries.T.float()).int() for part in rows.split(SAMPLES_AT_ONCE))
         return
     if device == "cuda":  # which multiplies whole groups
         queries = F.pad(queries, (0, 0, 0, -count % GROUP))

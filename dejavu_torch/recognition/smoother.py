@@ -26,9 +26,9 @@ from dejavu_torch.recognition.filter import near_scores, window_sums
 from dejavu_torch.recognition.motion import (
     MIN_PROBABILITY,
     Counts,
-    Layout,
     Motion,
     Rates,
+    States,
     checked_rates,
     logits,
 )
@@ -49,13 +49,13 @@ MIN_SEPARATION = 0.3
 # do not make a query count less
 SURE, SLOW_CHANGES = 2.5, 7.0
 FITTED, STRETCH, STRETCHES = 1000, 100, 10  # queries that are fitted to at most, in a stretch, and stretches
-LEAST, SAMPLED = 20, 2**21  # queries that are fitted to at least, and their scores at most otherwise
+FEWEST_FITTED, SAMPLED = 20, 2**21  # queries that are fitted to at least, and their scores at most otherwise
 CORRELATED = 4  # correlation times in a stretch, at least
 # nats above being off the map by which another speed is taken, in all and per query, and times as many as at
 # one place a query
 OTHER_SPEED, PER_QUERY, CLEARLY = 30.0, 0.1, 5.0
 WHOLE = "a smoother has to know the whole drive; expected a PlaceFilter, or a SequenceMatcher"
-BLOCK = 2**20  # numbers of a block of queries and states, which stays in the cache
+NUMBERS_AT_ONCE = 2**20  # numbers of a block of queries and states, which stays in the cache
 HELD = 2**25  # of all of them, up to which they are kept for the way back
 
 Rows = Callable[[Tensor], Tensor]  # numbers of queries (B,) -> their scores (B,N)
@@ -63,7 +63,7 @@ Likelihood = Callable[[int, int], Tensor]  # of the queries [first, last), (...,
 
 
 class Block(NamedTuple):
-    """Consecutive queries from `first` on, of a sweep: (..., B, S) each; see `Layout` for the states.
+    """Consecutive queries from `first` on, of a sweep: (..., B, S) each; see `States` for the states.
 
     before: beliefs given the queries before each. likelihood: of each query, 1 off the map. after: messages
     of the queries after each, of any scale. log: (..., B), likelihood of each query given those before.
@@ -80,19 +80,19 @@ class Block(NamedTuple):
         return normalised(self.before * self.likelihood * self.after)
 
 
-class Sample(NamedTuple):
-    """Stretches of a drive that a smoother is fitted to: (..., L, N) at the places of a layout; weight and
+class FittedPart(NamedTuple):
+    """Stretches of a drive that a smoother is fitted to: (..., L, N) at the places of a states; weight and
     still (..., L) as in `Spacing`."""
 
     std: Standardised
     weight: Tensor
     still: Tensor
-    layout: Layout
+    states: States
 
-    def part(self, first: int, last: int) -> Sample:
+    def part(self, first: int, last: int) -> FittedPart:
         """The queries [first, last) of each stretch."""
         std = self.std.map(lambda column: column.narrow(self.weight.ndim - 1, first, last - first))
-        return Sample(std, self.weight[..., first:last], self.still[..., first:last], self.layout)
+        return FittedPart(std, self.weight[..., first:last], self.still[..., first:last], self.states)
 
 
 class Fit(NamedTuple):
@@ -266,13 +266,13 @@ class PlaceSmoother(SequenceModel):
 
     def motion(self, places: int, route_starts: Sequence[int], like: Tensor) -> Motion:
         """The transitions of a map, in the type of its scores."""
-        return Motion(self.layout(places, route_starts), self.rates(like))
+        return Motion(self.states(places, route_starts), self.rates(like))
 
     def rates(self, like: Tensor) -> Rates:
         moves, (_, jump, leave) = (one.to(like).softmax(0) for one in (self.move_logits, self.rate_logits))
         return Rates(moves, jump, leave, self.enter_logit.to(like).sigmoid())
 
-    def layout(self, places: int, route_starts: Sequence[int] = (0,)) -> Layout:
+    def states(self, places: int, route_starts: Sequence[int] = (0,)) -> States:
         links = self.links + self.map_links
         if self.loop:
             ends = (*route_starts[1:], places)
@@ -281,7 +281,7 @@ class PlaceSmoother(SequenceModel):
             if not (0 <= first < places and 0 <= second < places and 0 <= share <= 1):
                 seen = f"the link {(first, second, share)} on {places} places"
                 raise InputError(f"{seen}; expected two of these places and a probability")
-        return Layout(places, 2, tuple(route_starts), links, self.turn)
+        return States(places, 2, tuple(route_starts), links, self.turn)
 
     @staticmethod
     def wide(places: Tensor, off: float) -> Tensor:
@@ -363,8 +363,8 @@ class PlaceSmoother(SequenceModel):
         std = standardised(known, self.means).map(lambda column: column.unflatten(0, picked.shape))
         ranks = RankTable()
         ranks.add(std.z, std.only((weight[picked] * std.speaks)[..., None].expand_as(std.z), 0))
-        layout = self.layout(places, route_starts)
-        return self.learn([Sample(std, weight[picked], still[picked], layout)], ranks, spacing)
+        states = self.states(places, route_starts)
+        return self.learn([FittedPart(std, weight[picked], still[picked], states)], ranks, spacing)
 
     def forget(self) -> None:
         """What an earlier drive told."""
@@ -372,7 +372,7 @@ class PlaceSmoother(SequenceModel):
         self.nats_per_query = self.jumps = 0.0
 
     @torch.no_grad()
-    def learn(self, samples: Sequence[Sample], ranks: RankTable, spacing: Spacing) -> Self:
+    def learn(self, samples: Sequence[FittedPart], ranks: RankTable, spacing: Spacing) -> Self:
         """As `fit`, from stretches of the drive and the ranks of all their scores."""
         self.correlation, self.tempering = spacing.correlation, tempering_of(spacing)
         moving = float(sum((~sample.still).sum() for sample in samples))
@@ -396,7 +396,7 @@ class PlaceSmoother(SequenceModel):
         return self
 
     def _fitted(
-        self, samples: Sequence[Sample], ranks: RankTable, start: Sequence[float], moved: float
+        self, samples: Sequence[FittedPart], ranks: RankTable, start: Sequence[float], moved: float
     ) -> Fit:
         """Expectation-maximisation from a start of the moves, which is their prior; `moved` queries move."""
         z = samples[0].std.z
@@ -406,7 +406,7 @@ class PlaceSmoother(SequenceModel):
         for _ in range(ROUNDS):
             values, table, sums, counts = table.values, RankTable(ranks.counts), z.new_zeros(2), []
             for sample in samples:
-                motion, later = Motion(sample.layout, rates), None
+                motion, later = Motion(sample.states, rates), None
                 for block in self.explained(sample, values, separation, motion):
                     first, last = block.first, block.first + block.log.shape[-1]
                     std, weight, *_ = sample.part(first, last)
@@ -433,27 +433,27 @@ class PlaceSmoother(SequenceModel):
         nats = (self._nats(samples, table.values, separation, one) for one in (rates, rare))
         return Fit(rates, separation, table.values, *nats)
 
-    def _nats(self, samples: Sequence[Sample], values: Tensor, separation: float, rates: Rates) -> float:
+    def _nats(self, samples: Sequence[FittedPart], values: Tensor, separation: float, rates: Rates) -> float:
         """By how much the model beats being off the map."""
         total = 0.0
         for sample in samples:
             *lead, queries = sample.weight.shape
-            size = max(1, BLOCK // (math.prod(lead) * (2 * sample.layout.places + 1)))
+            size = max(1, NUMBERS_AT_ONCE // (math.prod(lead) * (2 * sample.states.places + 1)))
             likelihood = self._likelihood(sample, values, separation)
-            parts = forward(Motion(sample.layout, rates), likelihood, range(0, queries, size), sample.still)
+            parts = forward(Motion(sample.states, rates), likelihood, range(0, queries, size), sample.still)
             total += float(sum(part.log.sum() for part in parts))
         return total
 
     def explained(
-        self, sample: Sample, values: Tensor, separation: float, motion: Motion, size: int | None = None
+        self, sample: FittedPart, values: Tensor, separation: float, motion: Motion, size: int | None = None
     ) -> Iterator[Block]:
         """What follows from a sample, in blocks of `size` queries, the last first."""
         *lead, queries = sample.weight.shape
         if size is None:
-            size = max(1, BLOCK // (math.prod(lead) * (2 * sample.layout.places + 1)))
+            size = max(1, NUMBERS_AT_ONCE // (math.prod(lead) * (2 * sample.states.places + 1)))
         yield from sweep(motion, self._likelihood(sample, values, separation), queries, sample.still, size)
 
-    def _likelihood(self, sample: Sample, values: Tensor, separation: float) -> Likelihood:
+    def _likelihood(self, sample: FittedPart, values: Tensor, separation: float) -> Likelihood:
         """The likelihoods of a sample."""
 
         def likelihood(first: int, last: int) -> Tensor:
@@ -520,10 +520,10 @@ def blocks_together(
     means = [drive.means for _, drive in drives]
     queries, places = len(drives[0][1].spacing.still), len(means[0])
     if size is None:
-        size = max(1, math.isqrt(queries), BLOCK // (len(drives) * (2 * places + 1)))
+        size = max(1, math.isqrt(queries), NUMBERS_AT_ONCE // (len(drives) * (2 * places + 1)))
     rates = (smoother.rates(mean) for (smoother, _), mean in zip(drives, means, strict=True))
-    layout = drives[0][0].layout(places, route_starts)
-    motion = Motion(layout, Rates(*map(torch.stack, zip(*rates, strict=True))))
+    states = drives[0][0].states(places, route_starts)
+    motion = Motion(states, Rates(*map(torch.stack, zip(*rates, strict=True))))
 
     def likelihood(first: int, last: int) -> Tensor:
         numbers = torch.arange(first, last)
@@ -654,7 +654,7 @@ def near_mass(mass: Tensor, radius: int) -> Tensor:
 
 def stretches(queries: int, correlation: float, places: int = 1, repeated: float = 1.0) -> Tensor:
     """Numbers of queries in evenly spaced stretches, (n,L); of few queries on a large map."""
-    used = min(queries, FITTED, max(LEAST, SAMPLED // places))
+    used = min(queries, FITTED, max(FEWEST_FITTED, SAMPLED // places))
     length = math.ceil(repeated * max(STRETCH, CORRELATED * correlation))
     n = max(1, min(STRETCHES, used // length))
     length = used // n

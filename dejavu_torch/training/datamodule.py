@@ -470,7 +470,7 @@ def store(traverse: Traverse, resize: tuple[int, int] | None = None) -> Tensor:
             expect(batch.isfinite().all(), "finite numbers", f"{traverse.name} holds NaN or infinite values")
             yield (batch if batch.ndim == 2 else (batch * 255).round().clamp(0, 255).byte().flatten(1)).cpu()
 
-    values = concatenate(rows())
+    values = concatenate(rows(), len(traverse))
     return values.view(len(values), *shape)
 
 

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal, NoReturn, cast
+from typing import Any, Literal, cast
 
 import pytorch_lightning as pl
 import torch
@@ -364,12 +364,6 @@ class RouteTask(pl.LightningModule):
         other = sorted(n for n in {**shapes, **wanted} if shapes.get(n, "") != wanted.get(n, ""))
         if other:
             raise InputError(f"the checkpoint is of another model than the config's: {', '.join(other[:3])}")
-
-
-def PlaceRecognitionTask(*_: object, **__: object) -> NoReturn:
-    """Raises an InputError that names what took its place."""
-    one, other = "DescriptorTask for a spectral map", "TemplateTask for templates"
-    raise InputError(f"PlaceRecognitionTask was divided; expected {one}, or {other}")
 
 
 def load_weights(task: RouteTask, path: str | Path) -> None:

@@ -418,7 +418,7 @@ def test_kept_frames_are_read_once_and_stay_the_same(whole):
 
 
 def test_frames_beyond_the_room_are_read_again(monkeypatch):
-    monkeypatch.setattr("dejavu_torch.data.traverse.KEPT", 4 * 3 * 8 * 8 * 5)
+    monkeypatch.setattr("dejavu_torch.data.traverse.KEPT_BYTES", 4 * 3 * 8 * 8 * 5)
     counted = Counted((torch.rand(20, 3, 8, 8) * 255).byte())
     expected, held = counted[:], kept(counted)
     counted.seen.clear()

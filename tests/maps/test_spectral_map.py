@@ -143,7 +143,7 @@ IN_BLOCKS = [
 @pytest.fixture
 def in_blocks(monkeypatch):
     """Every route is a long one; its lines are in a file."""
-    monkeypatch.setattr(quantisation, "BLOCK", 1000)
+    monkeypatch.setattr(quantisation, "NUMBERS_AT_ONCE", 1000)
     monkeypatch.setattr(quantisation, "empty", lambda *size: memory.empty(*size, in_memory=0))
 
 

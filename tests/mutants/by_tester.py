@@ -768,7 +768,7 @@ MUTANTS = [
     Mutant(
         "The places of a window are a share of the map, and jumps to others leave them.",
         "dejavu_torch/recognition/motion.py",
-        "left + (1 - layout.share) * self.free",
+        "left + (1 - states.share) * self.free",
         "left",
         ("tests/recognition/test_large.py::-k routes_and_circuits",),
     ),
@@ -901,8 +901,8 @@ MUTANTS = [
     Mutant(
         "New ground does not carry the light of its day.",
         "dejavu_torch/updating.py",
-        "place_map, queries = model.map, in_its_light(model, descriptors)",
-        "place_map, queries = model.map, descriptors",
+        "else model.map, in_its_light(model, descriptors)",
+        "else model.map, descriptors",
         ("tests/test_updating.py::-k light",),
     ),
     Mutant(
@@ -999,7 +999,7 @@ MUTANTS = [
     Mutant(
         "A filter over an area follows the moves of the camera.",
         "dejavu_torch/recognition/plane.py",
-        "return Followed(KEPT * self.moves + moves)",
+        "return Followed(PERSISTENCE * self.moves + moves)",
         "return self",
         ("tests/test_area.py::-k learns_the_course",),
     ),

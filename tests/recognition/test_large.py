@@ -15,7 +15,7 @@ from dejavu_torch.recognition import large
 from dejavu_torch.recognition.drive import DriveQuery, localize_drive
 from dejavu_torch.recognition.large import LargeDrive, Tiles, is_large
 from dejavu_torch.recognition.localizer import Localizer, Matching
-from dejavu_torch.recognition.motion import Layout, Motion, Rates
+from dejavu_torch.recognition.motion import Motion, Rates, States
 from dejavu_torch.recognition.smoother import PlaceSmoother
 
 
@@ -155,7 +155,7 @@ def test_candidates_are_apart(monkeypatch):
 
 
 def test_routes_and_circuits_end_where_they_say(monkeypatch):
-    whole = Layout(10, 2, (0, 6), ((9, 6, 1.0), (2, 0, 0.5)))
+    whole = States(10, 2, (0, 6), ((9, 6, 1.0), (2, 0, 0.5)))
     some = whole.of(torch.tensor([0, 1, 2, 5, 6, 7, 9]))
     assert some.route_starts == (0, 3, 4, 6)
     assert some.links == ((6, 4, 1.0), (2, 0, 0.5))

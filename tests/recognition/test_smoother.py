@@ -165,7 +165,7 @@ def test_climbing_the_likelihood_finds_the_moves_that_counting_finds():
     with torch.no_grad():
         rates = first.rates
         for _ in range(100):
-            motion = Motion(first.layout, rates)
+            motion = Motion(first.states, rates)
             (block,) = sweep(motion, lambda *_: like, len(like), drive.spacing.still, len(like))
             belief, after = normalised(block.before * block.likelihood), block.likelihood * block.after
             rates = updated_rates(motion.counts(belief[:-1], after[1:]), prior)

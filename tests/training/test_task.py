@@ -21,7 +21,6 @@ from small_training import (
 )
 from torch import Tensor, nn
 
-import dejavu_torch
 from dejavu_torch import DejaVu, Preprocess, TemplateMap
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.ground_truth import find_ground_truth
@@ -107,11 +106,6 @@ def test_places_without_a_layer_are_left_out(tmp_path):
 def test_what_cannot_be_trained_is_refused(tmp_path, settings, steps, facts):
     with refused(*facts):
         fit(tmp_path, new_task(**settings), data_of(), **steps)
-
-
-def test_the_task_of_before_names_those_that_took_its_place():
-    with refused("DescriptorTask for a spectral map", "TemplateTask for templates"):
-        dejavu_torch.PlaceRecognitionTask(backbone=nn.Identity())  # type: ignore[operator]
 
 
 # frames --------------------------------------------------------------------------------------------------

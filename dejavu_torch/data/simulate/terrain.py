@@ -36,7 +36,7 @@ from dejavu_torch.memory import check_room, in_float32, in_one_thread
 from dejavu_torch.types import expect
 
 PIXELS = 4  # per metre
-LEAST, MOST = 32, 2048  # metres
+SMALLEST, MOST = 32, 2048  # metres
 ROOM, ROOM_OF_BLOCK = 40.0, 5e7  # bytes per pixel while it is painted, and those of one block between roads
 VERGE = 7.0  # pixels of grass beside a road
 DASH = 48.0  # pixels from a lane dash to the next
@@ -108,7 +108,7 @@ class Block(NamedTuple):
 
 
 @dataclass
-class Ground:
+class Terrain:
     """What is painted where, by `random`, which is the same in all flights, and by `later` what differs."""
 
     canvas: Canvas
@@ -296,7 +296,7 @@ def paint_ground(seed: int, traverse: int, metres: int) -> Tensor:
     x = torch.arange(side) + 0.5
     canvas = Canvas(rgb(season.grass).repeat(1, side, side), grain, x, x[:, None], 1, sun)
     canvas.pixels.mul_(1 + 0.12 * grain)
-    ground, across, down = Ground(canvas, season, random, later), roads(random, side), roads(random, side)
+    ground, across, down = Terrain(canvas, season, random, later), roads(random, side), roads(random, side)
     kinds: list[str] = []
     for (top, bottom), (left, right) in product(pairwise(across), pairwise(down)):
         if not kinds:  # every kind, in any order
@@ -349,7 +349,7 @@ def open_terrain(
     """
     name, side = f"sim:terrain?seed={seed}&traverse={traverse}&metres={metres}", PIXELS * metres
     expect(seed >= 0 and traverse >= 0, "seed >= 0 and traverse >= 0", name)
-    expect(LEAST <= metres <= MOST, f"{LEAST} <= metres <= {MOST}", name)
+    expect(SMALLEST <= metres <= MOST, f"{SMALLEST} <= metres <= {MOST}", name)
     name += f"&window={window}&stride={stride}"
     expect(1 <= stride <= window <= side, f"1 <= stride <= window <= {side} pixels", name)
     check_room(ROOM * side**2 + ROOM_OF_BLOCK, name)
