@@ -15,7 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
-import dejavu_torch.area as areas
+import dejavu_torch.places.layout as areas
 from dejavu_torch import (
     DejaVu,
     PlaceFilter,
@@ -27,7 +27,7 @@ from dejavu_torch import (
     compare,
     open_source,
 )
-from dejavu_torch.area import Area, around, distance
+from dejavu_torch.area import Area
 from dejavu_torch.data.grid import Grid
 from dejavu_torch.evaluation.baselines import stored_frames
 from dejavu_torch.features.views import Sample
@@ -119,11 +119,10 @@ def test_columns_of_candidates_have_coordinates_without_a_warning():
 def test_neighbours_are_those_in_the_plane(small_tiles):
     area = Area(13, 17)
     place = area.place_at(torch.tensor([[5, 5], [0, 16]]))
-    near = around(place, 2, area.places, area)
+    near = area.around(place, 2)
     for one, found in zip(place, near, strict=True):
         every = torch.arange(area.places)
-        assert {*found.tolist()} == {*every[distance(every, one, area) <= 2].tolist()}
-    assert distance(torch.tensor(3), torch.tensor(10), None) == 7
+        assert {*found.tolist()} == {*every[area.distance(every, one) <= 2].tolist()}
 
 
 @given(rows=SIDES, columns=SIDES, transform=st.sampled_from(["dft", "dct"]), seed=st.integers(0, 99))
@@ -217,7 +216,7 @@ def test_candidates_are_apart_in_the_plane(small_tiles):
     scores = torch.rand(4, area.places)
     found = best_candidates(scores, 4, 3, area=area)
     for row in found.index:
-        apart = distance(row[:, None], row, area) + 99 * torch.eye(4, dtype=torch.long)
+        apart = area.distance(row[:, None], row) + 99 * torch.eye(4, dtype=torch.long)
         assert int(apart.min()) > 3
 
 
@@ -226,7 +225,7 @@ def test_every_kth_window_is_stored_in_both_directions(small_tiles):
     stored, nearest = stored_frames(area.places, 4, area)
     assert len(stored) == 4 * 5
     every = torch.arange(area.places)
-    assert int(distance(stored[nearest], every, area).max()) <= 2
+    assert int(area.distance(stored[nearest], every).max()) <= 2
     assert [table.tolist() for table in stored_frames(5, 2)] == [[0, 2, 4], [0, 1, 1, 2, 2]]
 
 
@@ -279,7 +278,7 @@ def test_a_filter_finds_a_flight_on_the_way(small_tiles):
     filter = PlaceFilter()
 
     def near(match):
-        return float((distance(match.index.clamp(min=0), truth, model.map.area) <= 2).double().mean())
+        return float((model.map.area.distance(match.index.clamp(min=0), truth) <= 2).double().mean())
 
     found = model.localize_descriptors(queries, filter)
     assert filter.area is None  # of a filter that may belong to several maps
@@ -371,14 +370,14 @@ def test_a_flight_is_found_where_single_images_are_not():
     queries = own[truth] + 0.22 * torch.randn(90, own.shape[1], generator=draw)
 
     def near(match):
-        return float((distance(match.index.clamp(min=0), truth, area) <= 2).double().mean())
+        return float((area.distance(match.index.clamp(min=0), truth) <= 2).double().mean())
 
     one, smoother = model.localize_descriptors(queries), PlaceSmoother()
     whole = model.localize_descriptors(queries, smoother)
     assert smoother.is_drive
     assert near(whole) > near(one) + 0.1
     assert near(whole) > 0.85
-    right = distance(whole.index.clamp(min=0), truth, area) <= 5
+    right = area.distance(whole.index.clamp(min=0), truth) <= 5
     assert float(whole.probability.mean()) == pytest.approx(float(right.double().mean()), abs=0.1)
     mixed = PlaceSmoother()
     model.localize_descriptors(queries[torch.randperm(90, generator=draw)], mixed)
@@ -464,7 +463,7 @@ def test_a_flight_is_placed_near_its_images():
     """On a map that tells every window: neighbours look alike, and rank nearly as high."""
     model, own, truth = flown(step=0.01)
     found = model.localize_descriptors(own[truth], PlaceSmoother())
-    off = distance(found.index.clamp(min=0), truth, model.map.area)
+    off = model.map.area.distance(found.index.clamp(min=0), truth)
     assert float(off.double().quantile(0.5)) <= 1
     assert float((off <= 2).double().mean()) > 0.8
 

@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 from PIL import Image
 from test_area import ground
 
-import dejavu_torch.area as areas
+import dejavu_torch.places.layout as areas
 from dejavu_torch import DejaVu, PlaceFilter, PlaceSmoother, SpectralMapper, open_source
-from dejavu_torch.area import Area, apart, area_of, around, distance, stored_area
+from dejavu_torch.area import Area, apart, area_of, stored_area
 from dejavu_torch.growth import append, associate, average, continued, merge
 from dejavu_torch.maps.spectral_map import SpectralMap
 from dejavu_torch.recognition.plane import as_plane, by_place
@@ -68,8 +68,8 @@ def test_every_window_has_one_place(area):
         assert int(known.sum()) == area.places
         values = torch.randn(2, area.places)
         assert torch.equal(by_place(as_plane(values, area), area), values)
-        for one, near in zip(places, around(places, 2, area.places, area), strict=True):
-            assert {*near.tolist()} == {*places[distance(places, one, area) <= 2].tolist()}
+        for one, near in zip(places, area.around(places, 2), strict=True):
+            assert {*near.tolist()} == {*places[area.distance(places, one) <= 2].tolist()}
         sizes = [part.places for part in area.rectangles]
         for part, own in zip(area.rectangles, places.split(sizes), strict=True):
             alone = part._replace(corner=(0, 0))
@@ -112,7 +112,7 @@ def test_an_area_grows_by_windows_of_the_same_ground(picture, small_tiles, tmp_p
     course = area.place_at(torch.stack([torch.arange(30) % 3 + 4, torch.arange(30) * 12 // 29], 1))
     for sequence in (PlaceSmoother(), PlaceFilter()):
         match = grown.localize_descriptors(queries[course], sequence)
-        off = distance(match.index.clamp(min=0), course, area)
+        off = area.distance(match.index.clamp(min=0), course)
         assert float((off <= 1).double().mean()) > 0.9
     assert separate.map.places + left.map.places == area.places
 

@@ -12,7 +12,8 @@ FILES = sorted(file.relative_to(PACKAGE) for file in PACKAGE.rglob("*.py"))
 SOURCES = {file: (PACKAGE / file).read_text(encoding="utf-8") for file in FILES}
 # what each room uses, all of it above: a new arrow between two rooms is a decision, and is written down here
 ARROWS = {
-    "area": "",
+    "places": "",
+    "area": "places",
     "lazy": "",
     "text": "",
     "version": "",
@@ -22,8 +23,8 @@ ARROWS = {
     "data": "area lazy text types memory resize",
     "features": "area text types memory resize data",
     "periods": "text types memory",
-    "maps": "area lazy types text memory data periods",
-    "recognition": "area text types memory maps",
+    "maps": "places area lazy types text memory data periods",
+    "recognition": "places area text types memory maps",
     "motion": "text types memory data",
     "learning": "area text types memory data features maps recognition motion",
     "model_file": "text version types memory data features periods maps recognition motion",
@@ -33,8 +34,8 @@ ARROWS = {
     "updating": "types data maps motion recognition model teaching growth",
     "cluster": "text types maps recognition",
     "live": "types memory data features recognition model",
-    "evaluation": "area lazy text version types memory resize data features periods maps recognition motion "
-    "model_file model growth",
+    "evaluation": "places area lazy text version types memory resize data features periods maps recognition "
+    "motion model_file model growth",
     "export": "text version types data features maps recognition model",
     "training": "lazy text types memory resize data features periods maps recognition "
     "motion model_file model growth evaluation",

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from dejavu_torch.area import Area, distance
+from dejavu_torch.area import Area
 from dejavu_torch.evaluation.controls import leave_out_match, null_map, with_mapper
 from dejavu_torch.evaluation.quantiser import CENTROIDS, product_quantised
 from dejavu_torch.features.descriptor import is_ready
@@ -27,6 +27,7 @@ from dejavu_torch.maps.template_map import TemplateMap, TemplateMapper
 from dejavu_torch.model import DejaVu
 from dejavu_torch.model_file import recipe_of
 from dejavu_torch.motion.resampling import ResampledTraverse
+from dejavu_torch.places.layout import Layout
 from dejavu_torch.recognition.drive import DriveQuery, localize_drives
 from dejavu_torch.recognition.localizer import SINGLE, Localizer, Matching, Scoring, drive_query, whole
 from dejavu_torch.recognition.smoother import PlaceSmoother
@@ -115,23 +116,8 @@ def scores_of_stored(
 
 
 def stored_frames(frames: int, k: int, area: Area | None = None) -> tuple[Tensor, Tensor]:
-    """The frames that a stride of k stores, (n,), and of each frame the nearest of these, (N,).
-
-    Example:
-        >>> [table.tolist() for table in stored_frames(6, 3)]
-        [[0, 3], [0, 0, 1, 1, 1, 1]]
-    """
-
-    def along(count: int) -> tuple[Tensor, Tensor]:
-        stored = torch.arange(0, count, k)
-        return stored, ((torch.arange(count) + k // 2) // k).clamp(max=len(stored) - 1)
-
-    if area is None:
-        return along(frames)
-    (rows, above), (columns, beside) = along(area.rows), along(area.columns)
-    cells = area.cells(torch.arange(frames))
-    stored = area.place_at(torch.cartesian_prod(rows, columns).view(-1, 2))
-    return stored, above[cells[:, 0]] * len(columns) + beside[cells[:, 1]]
+    """The frames that a stride of k stores, (n,), and of each frame which of these is nearest, (N,)."""
+    return (area or Layout(frames)).strided(k)
 
 
 def stride_bytes(frames: int, dimension: int, itemsize: int, k: int, area: Area | None = None) -> int:
@@ -185,21 +171,21 @@ def quantised_every_kth(
     """
     frames, width = descriptors.shape
     middle = torch.arange(frames)[1:-1]
-    if area is not None:
-        middle = middle[area.distance(middle - 1, middle + 1) == 2]
+    layout = area or Layout(frames)
+    middle = middle[layout.distance(middle - 1, middle + 1) == 2]
     middle = middle[torch.linspace(0, len(middle) - 1, min(ASKED, len(middle))).round().long()]
     asked, bits = (descriptors[middle - 1] + descriptors[middle + 1]) / 2, math.log2(centroids)
     best: Quantised | None = None
     fits = SAME_SIZE * each * frames
     for k in range(1, 2 * tolerance + 2):
-        stored = stored_frames(frames, k, area)[0]
+        stored = layout.strided(k)[0]
         codes = min(width, max(1, int(8 * fits / len(stored) / bits)))
         size = math.ceil(codes * bits * len(stored) / 8)
         if size > fits and (best is not None or k <= 2 * tolerance):  # one is taken in any case
             continue
         decoded, books = product_quantised(descriptors[stored], codes, seed, centroids, training)
         index = stored[(normalize(asked) @ normalize(decoded).T).argmax(1).cpu()]
-        share = float((distance(index, middle, area) <= tolerance).double().mean())
+        share = float((layout.distance(index, middle) <= tolerance).double().mean())
         if best is None or share > best.share:
             best, kept = Quantised(descriptors, k, size, books, share), (stored, decoded)
         if share == 1:  # no larger stride finds more

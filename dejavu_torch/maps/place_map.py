@@ -16,6 +16,7 @@ from dejavu_torch.area import Area
 from dejavu_torch.data.positions import count_places
 from dejavu_torch.maps.frame_table import FrameTable, Link, Route
 from dejavu_torch.maps.summary import MapSummary
+from dejavu_torch.places.layout import Layout
 from dejavu_torch.text import one_line
 from dejavu_torch.types import Facts, InputError, check_shape, expect
 
@@ -109,6 +110,11 @@ class PlaceMap(nn.Module, ABC):
     def block_places(self) -> int:
         """About how many numbers the largest block of `score_blocks` needs per query."""
         return self.places
+
+    @property
+    def layout(self) -> Layout:
+        """Where the places lie."""
+        return self.area or Layout(self.places)
 
     @property
     def table(self) -> FrameTable:

@@ -10,8 +10,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from dejavu_torch.area import Area, around, distance
+from dejavu_torch.area import Area
 from dejavu_torch.maps.place_map import PlaceMap
+from dejavu_torch.places.layout import Layout
 from dejavu_torch.recognition.filter import PlaceFilter, moments_of
 from dejavu_torch.recognition.select import best_candidates, best_match
 from dejavu_torch.recognition.smoother import Drive, PlaceSmoother
@@ -198,7 +199,7 @@ class Track:
 
 def _window(index: Tensor, radius: int, scores: Tensor, area: Area | None = None) -> Tensor:
     """The places within a radius of each index, (B,) -> (B,n), clamped to the map."""
-    return around(index.clamp(min=0), radius, scores.shape[1], area)
+    return (area or Layout(scores.shape[1])).around(index.clamp(min=0), radius)
 
 
 @torch.no_grad()
@@ -231,7 +232,7 @@ def calibrated(
             pairs = (single, confidence_of(single, area)), (filtered, Track(area)(filtered, single))
             for rows, (scored, confidences) in zip(answers, pairs, strict=True):
                 index = best_match(scored).index
-                near = distance(index.clamp(min=0), places.clamp(min=0), area) <= reach
+                near = place_map.layout.distance(index.clamp(min=0), places.clamp(min=0)) <= reach
                 right = near & (index >= 0) & (places >= 0) & on_map
                 columns = confidences, right, torch.full_like(right, on_map)
                 rows.append(tuple(column.cpu()[places.cpu() >= 0] for column in columns))

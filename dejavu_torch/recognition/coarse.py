@@ -247,7 +247,7 @@ class CoarseSearch(Scan):
         """Which queries lack some of the wanted candidates, (Q,)."""
         if score.shape[1] < max(k for k, _ in wanted):
             return score.new_ones(len(score), dtype=torch.bool)
-        enough = num_needed(wanted, self.place_map.places, self.place_map.area) - 1
+        enough = num_needed(wanted, self.place_map.layout) - 1
         if bool((score.isfinite().sum(1) > enough).all()):
             return score.new_zeros(len(score), dtype=torch.bool)
         area = self.place_map.area

@@ -109,8 +109,8 @@ class RowSearch(Scan):
         units, samples = units_of(self.place_map, queries), self.samples
         whole, step = to_int8(units)
         best = samples.best_of_groups(whole)
-        # each candidate suppresses 2 radius + 1 places, in an area in as many rows
-        rows = (1 if self.place_map.area is None else 2 * radius + 1 for _, radius in wanted)
+        # each candidate suppresses runs of 2 radius + 1 places
+        rows = (self.place_map.layout.near(radius) // (2 * radius + 1) for _, radius in wanted)
         each = zip(wanted, rows, strict=True)
         count = max(2 + (k - 1) * n * (2 * radius // GROUP + 2) for (k, radius), n in each)
         group, value = topk_groups(best, max(REFINED, count))

@@ -9,8 +9,8 @@ from typing import Literal, get_args
 import torch
 from torch import Tensor
 
-from dejavu_torch.area import Area
 from dejavu_torch.maps.place_map import PlaceMap
+from dejavu_torch.places.layout import Layout
 from dejavu_torch.types import expect
 
 Search = Literal["auto", "coarse", "exact", "scan"]
@@ -27,14 +27,9 @@ def check_search(method: str) -> None:
     expect(method in get_args(Search), "auto, coarse, exact or scan", f"search {method!r}")
 
 
-def num_needed(wanted: list[NmsSpec], places: int, area: Area | None = None) -> int:
-    """How many of the lowest scores include all candidates: each suppresses 2 radius + 1 places, and in an
-    area in as many rows."""
-
-    def suppressed(radius: int) -> int:
-        return (2 * radius + 1) * (1 if area is None else 2 * radius + 1)
-
-    return min(places, max((k - 1) * suppressed(radius) + 1 for k, radius in wanted))
+def num_needed(wanted: list[NmsSpec], layout: Layout) -> int:
+    """How many of the lowest scores include all candidates, each of which suppresses those near it."""
+    return min(layout.places, max((k - 1) * layout.near(radius) + 1 for k, radius in wanted))
 
 
 class Scan:
@@ -49,7 +44,7 @@ class Scan:
 
     @torch.no_grad()
     def __call__(self, queries: Tensor, wanted: list[NmsSpec]) -> TopK:
-        place_map, n = self.place_map, num_needed(wanted, self.place_map.places, self.place_map.area)
+        place_map, n = self.place_map, num_needed(wanted, self.place_map.layout)
         queries = queries.to(torch.promote_types(queries.dtype, torch.float32))
         (score, place), first = empty_topk(queries, n), 0
         for part in queries.split(max(1, SCORES_AT_ONCE // max(1, place_map.block_places))):

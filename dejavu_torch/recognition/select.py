@@ -9,7 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from dejavu_torch.area import Area, around, distance
+from dejavu_torch.places.layout import Layout
 from dejavu_torch.types import Match, check_shape, expect
 
 HIGHEST = torch.finfo(torch.float64).max  # threshold that accepts every finite score; JSON has no infinity
@@ -61,13 +61,13 @@ def best_match(scores: Tensor, threshold: float | None = None) -> Match:
 
 
 def best_candidates(
-    scores: Tensor, k: int, radius: int, places: Tensor | None = None, area: Area | None = None
+    scores: Tensor, k: int, radius: int, places: Tensor | None = None, area: Layout | None = None
 ) -> Match:
     """The k best places of each query, by non-maximum suppression with a radius in places.
 
     Args:
-        places: (Q,N) of the scores, if they are not all places in order. area: of the places, if they are of
-            one: the radius then counts rows and columns.
+        places: (Q,N) of the scores, if they are not all places in order. area: where
+            they lie: the radius counts rows and columns. None is along a route.
 
     Shape: (Q,N) -> Match of (Q,k).
 
@@ -76,9 +76,8 @@ def best_candidates(
     """
     expect(isinstance(scores, Tensor), "a tensor (Q,N)", f"scores are a {type(scores).__name__}")
     check_shape(scores, "Q N>=1", "scores are")
-    columns = scores.shape[1]
-    check_candidates(k, radius, columns)
-    found = []
+    check_candidates(k, radius, scores.shape[1])
+    layout, found = area or Layout(scores.shape[1]), []
     for rank in range(k):
         score, at = scores.min(1)
         index = at if places is None else places.gather(1, at[:, None])[:, 0]
@@ -86,9 +85,9 @@ def best_candidates(
         if rank + 1 == k:
             break
         if places is None:  # a border of the map may be named twice
-            scores = scores.scatter(1, around(at, radius, columns, area), torch.inf)
+            scores = scores.scatter(1, layout.around(at, radius), torch.inf)
         else:
-            scores = scores.masked_fill(distance(places, index[:, None], area) <= radius, torch.inf)
+            scores = scores.masked_fill(layout.distance(places, index[:, None]) <= radius, torch.inf)
     index, score = (torch.stack(column, 1) for column in zip(*found, strict=True))
     finite = score.isfinite()
     if k > 1:  # NaN in a query leaves it without candidates

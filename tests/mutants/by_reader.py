@@ -119,7 +119,7 @@ MUTANTS = [
     Mutant(
         "Two candidates of a query are more than `radius` places from each other, to both sides of the "
         "better one.",
-        "dejavu_torch/area.py",
+        "dejavu_torch/places/layout.py",
         "(places[:, None] + offset).clamp(0, count - 1)",
         "(places[:, None] + offset[:-1]).clamp(0, count - 1)",
         ("tests/recognition/test_select.py::test_candidates_equal_reference",),

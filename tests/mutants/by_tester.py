@@ -956,7 +956,7 @@ MUTANTS = [
     ),
     Mutant(
         "Candidates in an area are apart in rows and columns.",
-        "dejavu_torch/area.py",
+        "dejavu_torch/places/layout.py",
         "    if area is not None:\n        return area.around(places, radius)\n",
         "",
         ("tests/test_area.py::-k candidates_are_apart",),
@@ -1019,7 +1019,7 @@ MUTANTS = [
     ),
     Mutant(
         "Coordinates of areas are compared in double precision.",
-        "dejavu_torch/area.py",
+        "dejavu_torch/places/layout.py",
         "torch.tensor([part.first, part.down, part.right], dtype=torch.float64)",
         "torch.tensor([part.first, part.down, part.right]).double()",
         ("tests/test_grown_areas.py::-k exact",),
