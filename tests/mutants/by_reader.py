@@ -120,14 +120,14 @@ MUTANTS = [
         "Two candidates of a query are more than `radius` places from each other, to both sides of the "
         "better one.",
         "dejavu_torch/places/layout.py",
-        "(places[:, None] + offset).clamp(0, count - 1)",
-        "(places[:, None] + offset[:-1]).clamp(0, count - 1)",
+        "(places[:, None] + offset).clamp(0, self.rows - 1)",
+        "(places[:, None] + offset[:-1]).clamp(0, self.rows - 1)",
         ("tests/recognition/test_select.py::test_candidates_equal_reference",),
     ),
     Mutant(
         "A search keeps enough of the best places that candidates and probabilities are those of all scores.",
         "dejavu_torch/recognition/search.py",
-        "(k - 1) * suppressed(radius) + 1 for",
+        "(k - 1) * layout.near(radius) + 1 for",
         "(k - 1) * (radius + 1) + 1 for",
         ("tests/recognition/test_search.py::-k candidates_are_those or calibrated_map",),
     ),

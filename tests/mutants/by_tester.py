@@ -957,8 +957,8 @@ MUTANTS = [
     Mutant(
         "Candidates in an area are apart in rows and columns.",
         "dejavu_torch/places/layout.py",
-        "    if area is not None:\n        return area.around(places, radius)\n",
-        "",
+        "        if self.dimensions == 1:\n            return (places[:, None] + offset)",
+        "        if True:\n            return (places[:, None] + offset)",
         ("tests/test_area.py::-k candidates_are_apart",),
     ),
     Mutant(
