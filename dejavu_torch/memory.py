@@ -141,18 +141,23 @@ def concatenate(
         half: whether a file holds float16.
 
     Raises:
-        InputError: batches of different D or dtype, none at all, or no room for a file.
+        InputError: batches of different D or dtype, none at all, another number of rows, or no room for a
+            file.
     """
-    whole, first = torch.empty(0), 0
+    whole, kind, first = None, (0, torch.float32), 0
     for batch in batches:
         columns, dtype = batch.shape[1], batch.dtype
-        if not first:
+        if whole is None:
             whole, kind = _room(rows, batch, in_memory, half), (columns, dtype)
         before = f"{kind[0]} of {kind[1]} as before"
         expect(kind == (columns, dtype), before, f"features {first}.. are {columns} of {dtype}")
+        expect(
+            first + len(batch) <= rows, f"{rows}, as announced", f"there are {first + len(batch)} features"
+        )
         whole[first : first + len(batch)] = batch
         first += len(batch)
-    expect(first == rows > 0, f"{rows or 'some'}", f"there are {first or 'no'} features")
+    if whole is None or first != rows:
+        raise InputError(f"the features are {first}; expected {rows or 'at least one batch'}")
     return whole
 
 

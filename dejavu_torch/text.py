@@ -29,6 +29,16 @@ def plain_number(number: object) -> int | float:
     return int(value) if value.is_integer() else value
 
 
+def rounded(value: float) -> str:
+    """A length in words: three digits, or whole.
+
+    Example:
+        >>> rounded(0.12345), rounded(123456.7)
+        ('0.123', '123457')
+    """
+    return f"{value:.3g}" if abs(value) < 1000 else f"{value:.0f}"
+
+
 def one_line(text: object) -> str:
     """The text without line breaks; every run of blanks becomes one space."""
     return " ".join(str(text).split())

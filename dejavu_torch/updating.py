@@ -130,9 +130,9 @@ def update(
         shown.append(_names_of(traverse, frames))
     sizes = [place_map.table.frames, *(last - first for first, last in stretches)]
     calibration = refined.calibration if refined else model.calibration
-    model.frame_names = joined_names(shown, sizes)
-    model.replace_map(grown.linked(links))
-    model.calibration = calibration
+    grown, known = grown.linked(links), joined_names(shown, sizes)
+    model.replace_map(grown)
+    model.frame_names, model.calibration = known, calibration
     return Update(refinement, True, tuple(stretches), tuple(names), tuple(unknown))
 
 

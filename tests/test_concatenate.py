@@ -56,7 +56,10 @@ def test_mixed_and_missing_batches_are_refused():
         concatenate([torch.rand(2, 3), torch.rand(2, 4)], 4)
     with refused("features 2.. are 3 of torch.float64", "expected 3 of torch.float32"):
         concatenate([torch.rand(2, 3), torch.rand(2, 3).double()], 4)
-    with refused("no features"):
+    with refused("features are 0", "at least one batch"):
         concatenate([], 0)
-    with refused("2 features", "expected 4"):
+    with refused("features are 2", "expected 4"):
         concatenate([torch.rand(2, 3)], 4)
+    with refused("5 features", "expected 4"):
+        concatenate([torch.rand(2, 3), torch.rand(3, 3)], 4)
+    assert concatenate([torch.rand(0, 3)], 0).shape == (0, 3)

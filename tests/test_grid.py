@@ -26,6 +26,7 @@ from dejavu_torch.area import Ground
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.coordinates import coordinates_of, read_coordinates
 from dejavu_torch.data.flight import Flight
+from dejavu_torch.data.geotiff import from_degrees
 from dejavu_torch.data.grid import Grid
 from dejavu_torch.data.ground_truth import find_ground_truth
 from dejavu_torch.data.picture import Picture, read_picture
@@ -305,6 +306,13 @@ def test_what_cannot_be_reprojected_is_refused(geotiff):
         open_source(f"grid:{path}?window=32")
 
 
+def test_what_no_zone_covers_is_refused(geotiff):
+    for crs, size in (("EPSG:4326", 2.0), ("EPSG:3857", 150_000.0), ("EPSG:25832", 60_000.0)):
+        with refused("a.tif", "UTM zone", "gdal_translate -projwin"):
+            at = (4e5, 5.3e6) if crs == "EPSG:25832" else (-20, 40) if crs == "EPSG:4326" else (0, 5e6)
+            open_source(f"grid:{geotiff(ground(30, 40), crs=crs, at=at, size=size)}?window=16")
+
+
 def test_latitudes_are_those_of_the_map(geotiff, tmp_path):
     grid = open_source(f"grid:{geotiff(ground(100, 140), at=(500_000, 5_300_000))}?window=20&stride=20")
     (tmp_path / "photos.csv").write_text("lat,lon\n47.85,9.0005\nnan,nan\n")
@@ -314,9 +322,11 @@ def test_latitudes_are_those_of_the_map(geotiff, tmp_path):
     assert asked[0].tolist() == pytest.approx([500_037.4, 5_299_628.6], abs=0.1)  # 9 degrees east are 500 km
     assert asked[1].isnan().all()
     assert torch.equal(stored, grid.coordinates.values)
+    with refused("EPSG:32632", "expected ones that it covers"):
+        from_degrees(torch.tensor([[0.0, 100.0]]), UTM)
     swapped = own.coordinates._replace(values=asked.flip(1), degrees=False)
     own.coordinates = swapped
-    with refused("6.79e+06 m from that of", "a.tif", UTM, "or lat,lon"):
+    with refused("6787894 m from that of", "a.tif", UTM, "or lat,lon"):
         find_ground_truth("metres:5", grid, own, len(grid), 2)
 
 

@@ -19,11 +19,6 @@ class UsageError(InputError):
     """A command line or config file that the commands do not understand."""
 
 
-UNITS = {
-    "--tolerance": ", of frames; in an area, of its metres or pixels; or --truth metres:5 by coordinates"
-}
-
-
 def causes(error: BaseException | None) -> Iterator[BaseException]:
     """An exception and its causes; jsonargparse wraps each in one that says more."""
     while error is not None:

@@ -16,11 +16,13 @@ from torch import Tensor
 from dejavu_torch.area import Ground
 from dejavu_torch.data.files import reading
 from dejavu_torch.data.folder import as_bytes
-from dejavu_torch.types import Facts, expect
+from dejavu_torch.text import one_line
+from dejavu_torch.types import Facts, InputError, expect
 
 UNREAD, EXPECTED = "cannot be read as a TIFF", "a GeoTIFF of grey, RGB or more bands"
 DEGREES = "EPSG:4326"
 STRETCHED = 0.01  # by how much the sides of a pixel may differ from each other, and from metres on the ground
+MIDDLE, WIDEST = 5e5, 8e5  # metres east of a UTM zone's middle, and from it; there it stretches by 0.8 %
 EDGES, ROUNDING = 21, 1e-3  # points along a side that bound a file elsewhere; pixels
 KIND = "IMAGE_STRUCTURE"
 Points: TypeAlias = "np.ndarray[Any, np.dtype[np.float64]]"  # (N,2)
@@ -59,7 +61,7 @@ class GeoTiff:
             kind = {*file.tags(ns=KIND), *file.tags(1, ns=KIND), file.colorinterp[0].name}
             self.plain = kind.isdisjoint({"NBITS", "MINISWHITE", "palette"})
             placed = file.crs is not None and not file.transform.is_identity
-            system = _system_of_squares(file) if placed else ""
+            system = _system_of_squares(path, file) if placed else ""
         if system:
             seen = f"{path} has a palette, or bits, and pixels that are not square metres"
             expect(
@@ -107,7 +109,11 @@ def from_degrees(values: Tensor, system: str) -> Tensor:
 
 def _converted(one: Any, other: Any, points: Points) -> Points:
     """Points (N,2) of one coordinate system in another; degrees as longitude and latitude."""
-    x, y = import_module("rasterio.warp").transform(one, other, *points.T.tolist())
+    try:
+        x, y = import_module("rasterio.warp").transform(one, other, *points.T.tolist())
+    except Exception as error:  # of types that rasterio keeps to itself
+        seen = f"coordinates cannot be converted to {other}: {one_line(error)}"
+        raise InputError(f"{seen}; expected ones that it covers") from error
     return np.column_stack([x, y])
 
 
@@ -124,39 +130,40 @@ def _at(file: Any, pixels: Points) -> Points:
     return placed
 
 
-def _middle(file: Any) -> Points:
-    """The middle of a file, and those one column and one row behind it, (3,2), in its own system."""
-    middle = np.array([file.width, file.height]) / 2
-    return _at(file, middle + np.array([(0, 0), (1, 0), (0, 1)]))
-
-
-def _system_of_squares(file: Any) -> str:
+def _system_of_squares(path: Path, file: Any) -> str:
     """The coordinate system in which the pixels of a file become squares of metres; "" if they are that."""
-    crs, points = file.crs, _middle(file)
-    longitude, latitude = _converted(crs, DEGREES, points)[0]
+    parts = np.linspace(0, 1, 3)
+    corners = np.stack(np.meshgrid(parts * file.width, parts * file.height), -1).reshape(-1, 1, 2)
+    points = _at(file, (corners + np.array([(0, 0), (1, 0), (0, 1)])).reshape(-1, 2))  # and the next pixels
+    longitude, latitude = _converted(file.crs, DEGREES, points[12:13])[0]
     zone = f"EPSG:{32601 + 100 * (latitude < 0) + int((longitude + 180) // 6) % 60}"
-    steps, seen = (np.diff(at[[0, 1, 0, 2]], axis=0)[::2] for at in (points, _converted(crs, zone, points)))
-    told = np.hypot(*steps.T)
-    metres = crs.is_projected and crs.linear_units_factor[1] == 1
-    if not metres or not np.allclose(np.hypot(*seen.T) / told, 1, 0, STRETCHED):
+    on_ground = _converted(file.crs, zone, points)
+    far = float(np.abs(on_ground[:, 0] - MIDDLE).max())
+    part = f"a part of it, of at most {WIDEST / 1e3:g} km to each side, as by gdal_translate -projwin"
+    expect(far <= WIDEST, part, f"{path} reaches {far / 1e3:.0f} km from the middle of its UTM zone")
+    steps, seen = (one.reshape(9, 3, 2)[:, 1:] - one.reshape(9, 3, 2)[:, :1] for one in (points, on_ground))
+    told = np.linalg.norm(steps, axis=2)
+    metres = file.crs.is_projected and file.crs.linear_units_factor[1] == 1
+    if not metres or not np.allclose(np.linalg.norm(seen, axis=2) / told, 1, 0, STRETCHED):
         return zone
-    across, down = steps / told[:, None]
-    square = abs(told[0] / told[1] - 1) <= STRETCHED and abs(across @ down) <= STRETCHED
-    return "" if square else _name_of(crs)
+    across, down = steps[4] / told[4][:, None]
+    square = abs(told[4, 0] / told[4, 1] - 1) <= STRETCHED and abs(across @ down) <= STRETCHED
+    return "" if square else _name_of(file.crs)
 
 
 def _reprojected(file: Any, system: str) -> Any:
     """A file as it would be in a coordinate system, bilinear: north up, transparent beside it, in squares of
     the shorter side of the pixels in its middle."""
     rasterio, enums = import_module("rasterio"), import_module("rasterio.enums")
-    middle, *ends = _converted(file.crs, system, _middle(file))
+    pixels = np.array([file.width, file.height]) / 2 + np.array([(0, 0), (1, 0), (0, 1)])
+    middle, *ends = _converted(file.crs, system, _at(file, pixels))
     side = float(np.hypot(*(np.array(ends) - middle).T).min())
     parts = np.linspace(0, 1, EDGES)
     every = np.stack(np.meshgrid(parts * file.width, parts * file.height), -1).reshape(-1, 2)
     seen = _converted(file.crs, system, _at(file, every))
     (left, bottom), (right, top) = seen.min(0), seen.max(0)
     width, height = np.ceil(np.array([right - left, top - bottom]) / side - ROUNDING).astype(int).tolist()
-    place = rasterio.Affine.translation(left, top) @ rasterio.Affine.scale(side, -side)
+    place = rasterio.Affine(side, 0, left, 0, -side, top)
     told = {flag for flags in file.mask_flag_enums for flag in flags}
     options = {"crs": system, "transform": place, "width": width, "height": height}
     if told.isdisjoint({enums.MaskFlags.alpha, enums.MaskFlags.nodata}):

@@ -25,7 +25,7 @@ from dejavu_torch.data.coordinates import OF_MAPS, Near, coordinates_of
 from dejavu_torch.data.files import LARGEST, as_number, check_regular
 from dejavu_torch.data.truth_files import places_of_queries, read_csv, read_json, read_matrices
 from dejavu_torch.memory import check_room
-from dejavu_torch.text import one_line
+from dejavu_torch.text import one_line, rounded
 from dejavu_torch.types import InputError, Traverse, expect
 
 log = logging.getLogger("dejavu_torch")
@@ -342,7 +342,8 @@ def find_ground_truth(
         asked = _rows_of(asked, numbers)
         ground_truth = all_judged(near_truth(stored, asked, parsed.radius))
         ground_truth = ground_truth._replace(judged=~asked.isnan().any(1))
-        if not (ground_truth.positives >= 0).any():
+        known = stored.isfinite().all(1).any() and ground_truth.judged.any()
+        if known and not (ground_truth.positives >= 0).any():
             _refuse_distant(stored, asked, parsed, reference)
     elif parsed.suffix.lower() == ".npz":
         hard, *soft = read_matrices(parsed, numbers, frames, all_frames)
@@ -374,7 +375,7 @@ def _refuse_distant(stored: Tensor, asked: Tensor, near: Near, reference: Traver
     one, other = (table[~table.isnan().any(1)].median(0).values for table in (stored, asked))
     frame = "" if reference.coordinates is None else reference.coordinates.frame
     words, apart = describe_ground_truth(f"{near.kind}:{near.radius:g}"), float((one - other).norm())
-    seen = f"no query has a right answer {words}: their middle is {apart:.3g} {near.unit} from"
+    seen = f"no query has a right answer {words}: their middle is {rounded(apart)} {near.unit} from"
     wanted = f"coordinates in {frame}, or lat,lon" if OF_MAPS.match(frame) else "coordinates in one system"
     raise InputError(f"{seen} that of {reference.name}; expected {wanted}, or a larger distance")
 

@@ -52,6 +52,7 @@ Index = tuple[list[Any], list[int], Fraction | None]  # time stamps, key frames,
 # SWS_FULL_CHR_H_INT and _INP, which only new versions of av name; else colours are averaged over two columns
 FULL_CHROMA = 0x6000
 HDR = 16, 18  # transfer functions, as FFmpeg numbers them: SMPTE ST 2084 (PQ) and HLG
+UNKNOWN, BT2020 = 2, 9  # primaries, likewise
 EXACT = "gbrp16le"  # pixels until their brightness is changed
 _FORKED: list[object] = []  # decoders of parent processes
 
@@ -63,7 +64,7 @@ class Video(Traverse):
         path: a video file of any container and codec that FFmpeg reads.
         width, height: in pixels, resized by areas; 0 for both keeps the size, 0 for one the aspect ratio.
 
-    Shape: frames (n,3,H,W), always RGB of BT.709, rotated upright as the file says.
+    Shape: frames (n,3,H,W), always RGB, rotated upright as the file says; PQ and HLG become BT.709.
 
     Convention: a frame's name is its time, as 0:01:23.480. Opening reads the times of all frames, without
         decoding them where the file lists them (.mp4, .mov, .mkv, .webm, most .avi); a variable frame rate
@@ -300,14 +301,15 @@ def pixels_of(frame: VideoFrame, path: Path, width: int = 0, height: int = 0) ->
 def _mapped(picture: VideoFrame, transfer: int, primaries: int) -> VideoFrame:
     """A picture of high dynamic range as "rgb24" of the usual one: white, 203 cd/m2, becomes 255, and what is
     brighter is cut off."""
+    primaries = BT2020 if primaries == UNKNOWN else primaries
     picture.color_trc, picture.color_primaries = transfer, primaries
-    graph = _graph((os.getpid(), get_ident()), picture.width, picture.height)
+    graph = _graph((os.getpid(), get_ident(), transfer, primaries), picture.width, picture.height)
     graph.vpush(picture)
     return graph.vpull()
 
 
-@lru_cache(4)  # as the first picture of each takes seconds
-def _graph(thread: tuple[int, int], width: int, height: int) -> Graph:
+@lru_cache(16)  # as the first picture of each takes seconds
+def _graph(of: tuple[int, int, int, int], width: int, height: int) -> Graph:
     from av import VideoFormat
     from av.filter import Graph
 

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from dejavu_torch.data.coordinates import Near
 from dejavu_torch.recognition.select import PROBABLE
+from dejavu_torch.text import rounded
 from dejavu_torch.types import Facts, Match
 
 LEVELS = (0.9, PROBABLE)  # probabilities of being right at which answers are counted
@@ -51,7 +52,7 @@ class Shift(NamedTuple):
     confident: int
 
     def __str__(self) -> str:
-        x, y = (f"{'-' if by < 0 else '+'} {abs(by):.3g} {self.unit}" for by in self[:2])
+        x, y = (f"{'-' if by < 0 else '+'} {rounded(abs(by))} {self.unit}" for by in self[:2])
         return f"most confident answers ({self.answers} of {self.confident}) lie at x {x}, y {y}"
 
 
@@ -180,7 +181,7 @@ def describe_line(facts: Mapping[str, Any], scored: bool) -> str:
     """The line of `answer_facts`, or the shift of `metric_facts`, in words; "" without one."""
     if "shift" in facts:
         shift = f"{Shift(**facts['shift'])} of the coordinates of their queries"
-        hint = "are these the middles of the images, in the coordinates of the map?"
+        hint = "are these the middles of the images, in the same coordinates?"
         return f"the answers contradict the truth ({facts['truth']}): {shift}; {hint}"
     if "line" not in facts:
         return ""

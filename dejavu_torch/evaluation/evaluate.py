@@ -149,9 +149,10 @@ def evaluate_file(
     facts = evaluation_facts(match, candidates, known, tolerance, positions, described) | alone
     if near is not None and area is not None:
         facts |= {"tolerance": plain_number(near.radius), "unit": "pixels" if area.unit == "px" else "metres"}
-    if near is not None and reference is not None and query is not None:
-        stored, asked = coordinates_of([reference, query], near.kind)
-        facts |= shift_facts(near, here, stored[here.index], asked[queries])
+    if isinstance(parsed, Near) and loops is None and reference is not None and query is not None:
+        stored, asked = coordinates_of([reference, query], parsed.kind)
+        frames_found = here.index if place_map is None else place_map.frame_of(here.index)
+        facts |= shift_facts(parsed, here, stored[frames_found], asked[queries])
     accepted = facts["accepted"]
     facts["accepted_precision"] = facts["accepted_right"] / accepted if accepted else None
     facts |= {"matches": str(matches), "places": places}

@@ -323,7 +323,7 @@ def _borders(rows: int, columns: int) -> tuple[Tensor, Tensor]:
 @lru_cache(64)
 def _cached_borders(rows: int, columns: int, side: int) -> tuple[Tensor, Tensor]:
     down = _edges(rows, max(side, side * side // columns))
-    return down, _edges(columns, max(1, side * side // int(down.diff().max())))
+    return down, _edges(columns, max(1, side * side // max(1, int(down.diff().max()))))
 
 
 @lru_cache(2)  # of 16 bytes a window

@@ -81,7 +81,7 @@ class Block(NamedTuple):
 
 
 class FittedPart(NamedTuple):
-    """Stretches of a drive that a smoother is fitted to: (..., L, N) at the places of a states; weight and
+    """Stretches of a drive that a smoother is fitted to: (..., L, N) at some places; weight and
     still (..., L) as in `Spacing`."""
 
     std: Standardised

@@ -31,6 +31,7 @@ def test_a_route_is_one_column(places, radius, k, seed):
     for place, near in zip(one.tolist(), route.around(one, radius).tolist(), strict=True):
         assert {*near} == {*range(max(0, place - radius), min(places, place + radius + 1))}
     assert route.strided(k)[0].tolist() == [*range(0, places, k)]
+    assert [len(table) for table in Layout(0).strided(k)] == [0, 0]
 
 
 @given(rows=sides, columns=sides, radius=st.integers(0, 14), k=st.integers(1, 14))
