@@ -12,6 +12,7 @@ Supportive Feature Frequencies" (IROS 2017). From the paper's sections to the co
     eq. 3  distance to every phase of a layer    phase_distances     maps.distance
     eq. 4  scores S(i) of all places             TemplateMap         maps.template_map
            any kind of map                       PlaceMap            maps.place_map
+           where its places lie                  Layout              places.layout
            (ours) generalisation of templates    SpectralMapper      maps.spectral
     eq. 5  best place, eq. 6 acceptance          best_match          recognition.select
     IV-A   HOG features                          HOG, hog            features.hog
@@ -60,6 +61,7 @@ if TYPE_CHECKING:
     from dejavu_torch.motion.odometry import GroundOdometry as GroundOdometry
     from dejavu_torch.periods.imposed import ImposedPeriods as ImposedPeriods
     from dejavu_torch.periods.spectrogram import SpectrogramAnalysis as SpectrogramAnalysis
+    from dejavu_torch.places.layout import Layout as Layout
     from dejavu_torch.recognition.filter import PlaceFilter as PlaceFilter
     from dejavu_torch.recognition.select import best_match as best_match
     from dejavu_torch.recognition.sequence import SequenceMatcher as SequenceMatcher
@@ -91,6 +93,7 @@ _NAMES = {
     "motion.odometry": "GroundOdometry",
     "periods.imposed": "ImposedPeriods",
     "periods.spectrogram": "SpectrogramAnalysis",
+    "places.layout": "Layout",
     "recognition.filter": "PlaceFilter",
     "recognition.select": "best_match",
     "recognition.sequence": "SequenceMatcher",
