@@ -342,9 +342,8 @@ def calibration_of(
         length = max(SEGMENT, min(MAX_SEGMENT, SEGMENT_SCORES // place_map.places))
         views = _segments_of(views, length, max(FEWEST_FRAMES, CALIBRATION_SCORES // place_map.places))
     name = views.traverse.name
-    descriptors = concatenate(
-        descriptor.batches(views.traverse, progress, "calibrating"), len(views.traverse)
-    )
+    batches = descriptor.batches(views.traverse, progress, "calibrating")
+    descriptors = concatenate(batches, len(views.traverse))
     parts = zip(descriptors.split(length), views.places.split(length), strict=True)
     own = None
     if reference is not None and isinstance(place_map, SpectralMap):

@@ -151,11 +151,10 @@ def concatenate(
             whole, kind = _room(rows, batch, in_memory, half), (columns, dtype)
         before = f"{kind[0]} of {kind[1]} as before"
         expect(kind == (columns, dtype), before, f"features {first}.. are {columns} of {dtype}")
-        expect(
-            first + len(batch) <= rows, f"{rows}, as announced", f"there are {first + len(batch)} features"
-        )
-        whole[first : first + len(batch)] = batch
-        first += len(batch)
+        last = first + len(batch)
+        expect(last <= rows, f"{rows}, as announced", f"there are {last} features")
+        whole[first:last] = batch
+        first = last
     if whole is None or first != rows:
         raise InputError(f"the features are {first}; expected {rows or 'at least one batch'}")
     return whole

@@ -45,6 +45,8 @@ def conditions(tree):
     for node in ast.walk(tree):
         if isinstance(node, ast.If | ast.IfExp | ast.Assert | ast.While):
             yield node.test
+        elif isinstance(node, ast.BoolOp):  # a default by `or` asks, too
+            yield from node.values[:-1]
         elif isinstance(node, ast.Match):
             yield node.subject
         elif isinstance(node, ast.comprehension):
@@ -136,6 +138,7 @@ def test_nobody_asks_more_than_before():
         ("x = [i for i in y if area]", "area"),
         ("expect(area is None, 'a', 'b')", "area"),
         ("assert not place_map.routes", "routes"),
+        ("x = area or Layout(n)", "area"),
         ("while place_map.kind == 'spectral': pass", "maps"),
         ("match area:\n    case _: pass", "area"),
         ("isinstance(x, SpectralMap | TemplateMap)", "maps"),

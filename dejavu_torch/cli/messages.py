@@ -9,9 +9,7 @@ from dejavu_torch.model_file import REGISTRY
 from dejavu_torch.text import one_line
 from dejavu_torch.types import InputError
 
-UNITS = {
-    "--tolerance": ", of frames; in an area, of its metres or pixels; or --truth metres:5 by coordinates"
-}
+UNITS = {"--tolerance": " of frames, or in an area of metres or pixels; by coordinates, --truth metres:5"}
 LONGEST = 300  # characters of a message; longer ones are cut
 
 

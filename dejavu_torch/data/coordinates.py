@@ -64,8 +64,8 @@ def coordinates_of(traverses: Sequence[Traverse], kind: Kind) -> list[Tensor]:
     are converted to the coordinate system of the other traverse, if it is that of a map.
 
     Raises:
-        InputError: as `named_coordinates`; only some traverses that carry some, or of different kinds or
-            frames.
+        InputError: as `named_coordinates` and `from_degrees`; some that carry none, or of different kinds
+            or frames.
     """
     carried = [traverse.coordinates for traverse in traverses]
     if kind not in ("metres", "pixels") or not any(carried):

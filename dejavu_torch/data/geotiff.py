@@ -50,8 +50,8 @@ class GeoTiff:
         while it is read, to the UTM zone of its middle, or, if it is in metres already, to its own system.
 
     Raises:
-        InputError: no TIFF, or one to be reprojected that is not `plain`; while reading, values outside
-            [0, 1].
+        InputError: no TIFF; one to be reprojected that is not `plain`, or reaches over 800 km from the middle
+            of a UTM zone; while reading, values outside [0, 1].
     """
 
     def __init__(self, path: Path) -> None:
@@ -63,17 +63,14 @@ class GeoTiff:
             placed = file.crs is not None and not file.transform.is_identity
             system = _system_of_squares(path, file) if placed else ""
         if system:
-            seen = f"{path} has a palette, or bits, and pixels that are not square metres"
-            expect(
-                self.plain, f"colours, as by gdal_translate -expand rgb and gdalwarp -t_srs {system}", seen
-            )
+            seen = f"{path} has a palette, or bits, and pixels that are no squares of metres"
+            how = f"gdal_translate -expand rgb, then gdalwarp -t_srs {system}"
+            expect(self.plain, f"colours, as by {how}", seen)
             self._file, self._system = None, system
         with self._opened() as file:
             self.shape, at = (len(self.bands), file.height, file.width), file.transform
-            ground = Ground(
-                (at.c, at.f), (at.a, at.d), (at.b, at.e), "m", _name_of(file.crs) if placed else ""
-            )
-            self.ground = ground if placed else None
+            corner = (at.c, at.f), (at.a, at.d), (at.b, at.e)
+            self.ground = Ground(*corner, "m", _name_of(file.crs)) if placed else None
 
     def __getstate__(self) -> Facts:
         return self.__dict__ | {"_file": None}
@@ -100,7 +97,8 @@ class GeoTiff:
 
 
 def from_degrees(values: Tensor, system: str) -> Tensor:
-    """Latitudes and longitudes (N,2) as x and y (N,2) in a coordinate system, float64; NaN stays."""
+    """Latitudes and longitudes (N,2) as x and y (N,2) in a coordinate system, float64; NaN stays.
+    InputError outside it, or without rasterio."""
     expect(has_rasterio(), "pip install 'dejavu_torch[geo]'", f"degrees to be converted to {system}")
     known, found = ~values.isnan().any(1), torch.full_like(values, torch.nan)
     found[known] = torch.from_numpy(_converted(DEGREES, system, values[known].fliplr().numpy()))

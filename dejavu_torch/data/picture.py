@@ -26,10 +26,8 @@ from dejavu_torch.types import Facts, InputError
 
 log = logging.getLogger("dejavu_torch")
 
-SIDE_READ, HELD = (
-    512,
-    2**27,
-)  # pixels of the file to a side that are read together; bytes of them that are kept
+SIDE_READ = 512  # pixels of the file to a side that are read together
+HELD = 2**27  # bytes of them that are kept
 BYTES_PER_PIXEL = 8.0  # peak while a picture is decoded whole
 TIFF, ORIENTATION, GEOREFERENCED = {".tif", ".tiff"}, 274, {33550, 34264}  # tags; size of a pixel, a matrix
 

@@ -113,9 +113,9 @@ def match_facts(
 
 def metric_facts(run: Localization, truth: Truth | None) -> Facts:
     """The entry `error_metres` or `error_pixels` of report.json: quantiles of the distances between queries
-    and the places reported for them, where the truth is by coordinates; and `shift`, see `Shift`, if most of
-    the confident answers lie in one direction from it. In an area also `recall_within`, the
-    share of the queries with coordinates within 1, 2 and 5 metres, or windows."""
+    and the places reported for them, where the truth is by coordinates; and `shift`, see `shift_facts`. In an
+    area also `recall_within`, the share of the queries with coordinates within 1, 2 and 5 metres, or
+    windows."""
     parsed = None if truth is None else check_ground_truth(truth)
     if not isinstance(parsed, Near):
         return {}

@@ -58,9 +58,8 @@ def encode(levels: Tensor) -> Stream:
     packed = bytearray()
     _, row, (low, _, size) = _run(numbers, packed)
     packed[size:] = bytes(1)
-    _put(
-        int(low) + SMALLEST - 1, size, packed
-    )  # the first byte of a number in the interval; the others are 0
+    # the first byte of a number in the interval; the others are 0
+    _put(int(low) + SMALLEST - 1, size, packed)
     _check_size(row, numbers.shape[1], len(packed))
     return Stream(torch.frombuffer(packed, dtype=torch.uint8), _checksum(numbers))
 

@@ -246,9 +246,8 @@ class Layout(NamedTuple):
     def between(self, start: int, stop: int) -> Layout:
         """The area of some of the parts: those of the places [start, stop)."""
         first = accumulate((part.places for part in self.rectangles), initial=0)
-        return Layout.of(
-            [part for part, at in zip(self.rectangles, first, strict=False) if start <= at < stop]
-        )
+        parts = zip(self.rectangles, first, strict=False)
+        return Layout.of([part for part, at in parts if start <= at < stop])
 
 
 def apart(areas: Sequence[Layout]) -> Layout:

@@ -66,8 +66,8 @@ def best_candidates(
     """The k best places of each query, by non-maximum suppression with a radius in places.
 
     Args:
-        places: (Q,N) of the scores, if they are not all places in order. area: where
-            they lie: the radius counts rows and columns. None is along a route.
+        places: (Q,N) of the scores, if they are not all places in order. area: where the places lie; the
+            radius counts rows and columns. None is a route.
 
     Shape: (Q,N) -> Match of (Q,k).
 

@@ -63,7 +63,7 @@ Likelihood = Callable[[int, int], Tensor]  # of the queries [first, last), (...,
 
 
 class Block(NamedTuple):
-    """Consecutive queries from `first` on, of a sweep: (..., B, S) each; see `States` for the states.
+    """Consecutive queries from `first` on, of a sweep: (..., B, S) each, as `States` numbers them.
 
     before: beliefs given the queries before each. likelihood: of each query, 1 off the map. after: messages
     of the queries after each, of any scale. log: (..., B), likelihood of each query given those before.
@@ -81,7 +81,7 @@ class Block(NamedTuple):
 
 
 class FittedPart(NamedTuple):
-    """Stretches of a drive that a smoother is fitted to: (..., L, N) at some places; weight and
+    """Stretches of a drive that a smoother is fitted to: (..., L, N) at the places of `states`; weight and
     still (..., L) as in `Spacing`."""
 
     std: Standardised
