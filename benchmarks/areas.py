@@ -15,13 +15,13 @@ from benchmarks.front import summarised
 from benchmarks.measure import Row, write_bench
 from benchmarks.quantisers import Quantiser
 from dejavu_torch import DejaVu, PlaceFilter, PlaceSmoother, SpectralMapper, Whitening
-from dejavu_torch.area import Area
 from dejavu_torch.data.demo import open_area
 from dejavu_torch.evaluation.baselines import as_int8, scores_of_stored, stored_frames
 from dejavu_torch.evaluation.contenders import COLOURS
 from dejavu_torch.evaluation.controls import shuffled
 from dejavu_torch.evaluation.plots import Plot, legend
 from dejavu_torch.evaluation.quantiser import product_quantised
+from dejavu_torch.places.layout import Layout
 from dejavu_torch.recognition.drive import localize_drive
 from dejavu_torch.recognition.localizer import Localizer, Matching, Scoring, drive_query
 
@@ -48,7 +48,7 @@ NAMES = {
 }
 
 
-def ways_of(places: Tensor, area: Area, seed: int) -> Iterator[tuple[str, float, Scoring]]:
+def ways_of(places: Tensor, area: Layout, seed: int) -> Iterator[tuple[str, float, Scoring]]:
     """Keys, bytes per place and scores of all ways to store descriptors (N,K) of an area."""
     order, mixed = shuffled(places, seed)
     by_row = torch.cartesian_prod(torch.arange(area.rows), torch.arange(area.columns))
@@ -93,23 +93,23 @@ def measured(seed: int) -> list[Row]:
     where, own = reference.coordinates, second.coordinates
     assert where is not None
     assert own is not None
-    path = second.area.place_at(flight(second.area, draw))
+    path = second.layout.place_at(flight(second.layout, draw))
     flown = torch.cat([model.descriptor(second[part.tolist()]) for part in path.split(64)])
     rows = []
-    for key, size, score in ways_of(places, reference.area, seed):
+    for key, size, score in ways_of(places, reference.layout, seed):
         best = torch.cat([score(part).argmin(1) for part in queries.split(256)])
         if key == "stride":  # of equal scores, the place that is stored
-            kept, nearest = stored_frames(len(places), SKIPPED, reference.area)
+            kept, nearest = stored_frames(len(places), SKIPPED, reference.layout)
             best = kept[nearest[best]]
         right = (where.values[best] - own.values[asked]).norm(dim=1) <= RADIUS
         row: Row = {"seed": seed, "contender": key, "bytes_per_place": size}
         rows.append(row | {"recall_at_1": float(right.double().mean())})
         if key in FLOWN:
             smoother = PlaceSmoother(within=round(RADIUS / STRIDE))
-            found = localize_drive(drive_query(flown, smoother, score, area=reference.area))
+            found = localize_drive(drive_query(flown, smoother, score, layout=reference.layout))
             right = (where.values[found.index[:, 0]] - own.values[path]).norm(dim=1) <= RADIUS
             sure = found.probability[:, 0] >= 0.5 if found.probability is not None else right
-            matcher = Localizer(None, Matching(PlaceFilter()), area=reference.area)
+            matcher = Localizer(None, Matching(PlaceFilter()), layout=reference.layout)
             live = matcher.match(torch.cat([score(part) for part in flown.split(64)])).index
             on_the_way = (where.values[live] - own.values[path]).norm(dim=1) <= RADIUS
             shares = right, sure & ~right, on_the_way
@@ -117,7 +117,7 @@ def measured(seed: int) -> list[Row]:
     return rows
 
 
-def flight(area: Area, draw: torch.Generator) -> Tensor:
+def flight(area: Layout, draw: torch.Generator) -> Tensor:
     """Cells of windows along a flight that winds over the area from left to right, (n,2)."""
     at, course, cells = torch.tensor([area.rows / 2, 0.0]), 0.0, []
     while float(at[1]) < area.columns - 1:

@@ -249,8 +249,8 @@ def bench_cross(name: str, data: Path, seed: int = 0, rate: float | None = None)
 def flown(name: str) -> tuple[Grid, Grid, Tensor]:
     """The reference of an area, and a flight over it: windows at each pixel, and the numbers of some."""
     first, second = AREAS[name](0, STRIDE), AREAS[name](1, 1)
-    path = flight(second.area, torch.Generator().manual_seed(0))
-    return first, second, second.area.place_at(path)
+    path = flight(second.layout, torch.Generator().manual_seed(0))
+    return first, second, second.layout.place_at(path)
 
 
 def board_of(name: str, data: Path, rate: float | None = None) -> Board:
@@ -259,9 +259,9 @@ def board_of(name: str, data: Path, rate: float | None = None) -> Board:
     if name in AREAS:
         first, second, path = flown(name)
         model.learn(first)
-        places = first.area.place_near(second.area.coordinates(path))[:, None]
+        places = first.layout.place_near(second.layout.coordinates(path))[:, None]
         radius = round(RADIUS / STRIDE)
-        truth = widened(all_judged(places), first.area, radius)
+        truth = widened(all_judged(places), first.layout, radius)
         return Board(model, (name,), model.descriptor.all_of(Part(second, path)).float(), truth, radius)
     routes: tuple[str, ...] = PARTS_OF_MERGED if name == MERGED else (name,)
     footage = FOOTAGE[routes[0]]
@@ -344,7 +344,7 @@ def facts_of(board: Board, queries: Tensor, truth: GroundTruth | None = None) ->
     found: dict[str, Any] = {"queries": len(queries), "taken": smoother.is_drive}
     found |= {key: value for key, value in smoother.settled().items() if isinstance(value, float)}
     ways = {"drive": drive}
-    within = max(1, tolerance) if model.map.area is None else 0  # the truth has all windows of an area
+    within = {1: max(1, tolerance), 2: 0}[model.map.layout.dimensions]  # the truth has all windows of an area
     if model.calibration is not None:
         ways["one"] = model.localize_descriptors(moved, model.matching()._replace(radius=tolerance))
         if model.calibration.filter is not None:

@@ -13,10 +13,10 @@ from benchmarks.areas import RADIUS, SEEDS, STRIDE, flight
 from benchmarks.front import summarised
 from benchmarks.measure import Row, write_bench
 from dejavu_torch import DejaVu, PlaceSmoother, Whitening
-from dejavu_torch.area import Area
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.demo import FOLDER, open_area
 from dejavu_torch.data.folder import read_image
+from dejavu_torch.places.layout import Layout
 
 QUERIES, SIDE, MARGIN = 500, 64, 46  # images, their sides, and pixels from their middle that they need
 HEADINGS, OF_FLIGHT = (8, 12, 24, 36), 24
@@ -47,7 +47,7 @@ def measured(seed: int) -> list[Row]:
     inner = torch.tensor([picture.shape[2], picture.shape[1]]) - 2 * MARGIN
     middle = MARGIN + inner * torch.rand(QUERIES, 2, generator=draw)
     heading = 360 * torch.rand(QUERIES, generator=draw)
-    path = MARGIN + flight(Area(int(inner[1]), int(inner[0])), draw).flip(1).double()
+    path = MARGIN + flight(Layout(int(inner[1]), int(inner[0])), draw).flip(1).double()
     wandering = (WANDER * torch.randn(len(path), generator=draw)).cumsum(0)
     turned, flown = seen(picture, middle, heading), seen(picture, path, wandering)
     cases: list[tuple[str, Tensor, Tensor, int, Tensor | None]]
@@ -63,7 +63,7 @@ def measured(seed: int) -> list[Row]:
         within = PlaceSmoother(within=round(RADIUS / STRIDE)) if key.startswith("flight") else None
         match = model.localize(query, sequence=within, headings=count)
         passed = 1000 * (time.perf_counter() - began) / len(images)
-        right = (reference.area.coordinates(match.index) - where).norm(dim=1) <= RADIUS
+        right = (reference.layout.coordinates(match.index) - where).norm(dim=1) <= RADIUS
         shares = (right, match.accepted, match.accepted & ~right)
         figures = [*(float(one.double().mean()) for one in shares), passed]
         row: Row = {"seed": seed, "contender": key, "bytes_per_place": 8.0}

@@ -17,12 +17,12 @@ from benchmarks.areas import flight, in_order
 from benchmarks.front import summarised
 from benchmarks.measure import Row, write_bench
 from dejavu_torch import DejaVu, PlaceSmoother, SpectralMapper
-from dejavu_torch.area import Area
 from dejavu_torch.data.simulate.terrain import open_terrain
 from dejavu_torch.data.traverse import Part
 from dejavu_torch.evaluation.baselines import scores_of_stored
 from dejavu_torch.evaluation.controls import shuffled
 from dejavu_torch.features.whitening import Whitening
+from dejavu_torch.places.layout import Layout
 from dejavu_torch.recognition.drive import localize_drive
 from dejavu_torch.recognition.localizer import Scoring, drive_query
 
@@ -37,7 +37,7 @@ FOUND = [f"{kind}recall_{radius}m" for kind in ("", "flight_") for radius in RAD
 NAMES = {"map": "this map", "null": "shuffled windows", "uncompressed": "float32, every window"}
 
 
-def found_within(places: Tensor, area: Area, where: Tensor) -> list[float]:
+def found_within(places: Tensor, area: Layout, where: Tensor) -> list[float]:
     """Shares of places (Q,) within some distances of the middles (Q,2) of queries."""
     off = (area.coordinates(places.clamp(min=0)) - where).norm(dim=1).masked_fill(places < 0, torch.inf)
     return [float((off <= radius).double().mean()) for radius in RADII]
@@ -60,7 +60,7 @@ def learned(model: DejaVu, seed: int, metres: int, queries: int = ALONE) -> Row:
     return {"learn_seconds": seconds, "bytes": size, "ms": sorted(ms)[len(ms) // 2]}
 
 
-def ways_of(places: Tensor, area: Area, seed: int) -> Iterator[tuple[str, float, Scoring]]:
+def ways_of(places: Tensor, area: Layout, seed: int) -> Iterator[tuple[str, float, Scoring]]:
     """Keys, bytes per place and scores of the map, of its control and of all descriptors (N,K)."""
     order, mixed = shuffled(places, seed)
     for size in SIZES:
@@ -76,11 +76,11 @@ def measured(seed: int, metres: int) -> list[Row]:
     """The rows of a seed."""
     reference, second = open_terrain(seed, 0, metres), open_terrain(seed, 1, metres, stride=1)
     assert second.coordinates is not None
-    area, where, draw = reference.area, second.coordinates.values, torch.Generator().manual_seed(seed)
+    area, where, draw = reference.layout, second.coordinates.values, torch.Generator().manual_seed(seed)
     model = DejaVu(whitening=Whitening(seed=seed), mapper=SpectralMapper(LEARNED))
     facts = learned(model, seed, metres)
     asked = torch.randint(len(second), (QUERIES,), generator=draw)
-    path = second.area.place_at(flight(second.area, draw)[:FLOWN])
+    path = second.layout.place_at(flight(second.layout, draw)[:FLOWN])
     places = torch.cat([*model.descriptor.batches(reference, shared=True)]).float()  # as the map's
     queries, flown = (model.descriptor.all_of(Part(second, one)).float() for one in (asked, path))
     rows: list[Row] = []
@@ -88,7 +88,7 @@ def measured(seed: int, metres: int) -> list[Row]:
         single = torch.cat([score(part).argmin(1) for part in queries.split(20)])
         found = found_within(single, area, where[asked])
         if size in FLOWN_AT or key == "uncompressed":
-            whole = localize_drive(drive_query(flown, PlaceSmoother(), score, area=area)).index[:, 0]
+            whole = localize_drive(drive_query(flown, PlaceSmoother(), score, layout=area)).index[:, 0]
             found += found_within(whole, area, where[path])
         row: Row = {"seed": seed, "contender": key, "bytes_per_place": size, "places": len(reference)}
         rows.append(row | dict(zip(FOUND, found, strict=False)))

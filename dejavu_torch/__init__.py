@@ -66,11 +66,11 @@ if TYPE_CHECKING:
     from dejavu_torch.recognition.select import best_match as best_match
     from dejavu_torch.recognition.sequence import SequenceMatcher as SequenceMatcher
     from dejavu_torch.recognition.smoother import PlaceSmoother as PlaceSmoother
+    from dejavu_torch.text import InputError as InputError
     from dejavu_torch.training.datamodule import RouteData as RouteData
     from dejavu_torch.training.descriptors import DescriptorTask as DescriptorTask
     from dejavu_torch.training.templates import TemplateTask as TemplateTask
     from dejavu_torch.types import FrequencyLayer as FrequencyLayer
-    from dejavu_torch.types import InputError as InputError
     from dejavu_torch.types import Match as Match
     from dejavu_torch.types import Traverse as Traverse
 
@@ -98,10 +98,11 @@ _NAMES = {
     "recognition.select": "best_match",
     "recognition.sequence": "SequenceMatcher",
     "recognition.smoother": "PlaceSmoother",
+    "text": "InputError",
     "training.datamodule": "RouteData",
     "training.descriptors": "DescriptorTask",
     "training.templates": "TemplateTask",
-    "types": "FrequencyLayer InputError Match Traverse",
+    "types": "FrequencyLayer Match Traverse",
 }
 _HOMES = homes_of(_NAMES)
 __all__ = sorted(_HOMES)

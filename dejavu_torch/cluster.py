@@ -28,7 +28,7 @@ from dejavu_torch.maps.spectral_map import Chunk, SpectralMap
 from dejavu_torch.recognition.coarse import searcher
 from dejavu_torch.recognition.search import NmsSpec, Search, TopK
 from dejavu_torch.text import one_line
-from dejavu_torch.types import InputError, expect
+from dejavu_torch.types import InputError
 
 SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
 AUTO = "auto"
@@ -133,7 +133,7 @@ class ClusterSearch:
         if not isinstance(place_map, SpectralMap):
             raise InputError(f"a map of kind {place_map.kind!r} cannot be divided; expected a spectral one")
         seen = "the map of an area cannot be divided among workers"
-        expect(place_map.area is None, "that of a route, or no --cluster", seen)
+        place_map.layout.expect_route("that of a route, or no --cluster", seen)
         actor = cluster.ray.remote(num_cpus=1, max_restarts=RETRIES, max_task_retries=RETRIES)(_Searcher)
         self.cluster, self.actors = cluster, []
         self.parts: list[object] = []  # kept for restarted actors

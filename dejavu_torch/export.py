@@ -168,14 +168,13 @@ def export_onnx(
             seen = f"an export needs {name}, which cannot be imported ({one_line(error)})"
             raise InputError(f"{seen}; expected it: pip install 'dejavu_torch[export]'") from error
     require_map(model)
-    routes = ", ".join(route.name for route in model.map.routes)
-    expect(not model.map.routes, "to export the map of each", f"the map has the routes {routes}")
+    model.map.layout.expect_one("to export the map of each")
     if model.frame_shape is None:
         raise InputError("the map does not know its frames; expected a map learned from a source")
     if sequence is not None:
         sequence.check(None, model.map.places)
         seen = f"the map of an area, and {type(sequence).__name__}"
-        expect(model.map.area is None, "single queries to export", seen)
+        model.map.layout.expect_route("single queries to export", seen)
     if isinstance(sequence, PlaceFilter) and sequence.lag:
         seen = f"a filter with a lag of {sequence.lag}"
         raise InputError(f"{seen}; expected one without: an ONNX file answers each frame at once")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import logging
-import math
 from collections.abc import Container, Sequence
 from itertools import accumulate, count
 
@@ -13,19 +12,19 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from dejavu_torch import learning
-from dejavu_torch.area import Area, agree
 from dejavu_torch.data.ground_truth import find_ground_truth, names_agree
-from dejavu_torch.data.positions import positions_behind
 from dejavu_torch.data.source import Source, as_traverse
 from dejavu_torch.data.traverse import chained
 from dejavu_torch.features.views import LabelledFrames
 from dejavu_torch.maps.file import checksums, digests
-from dejavu_torch.maps.frame_table import FrameTable
 from dejavu_torch.maps.spectral import SpectralMapper, encode_chunk
 from dejavu_torch.maps.spectral_map import LARGEST, Chunk, SpectralMap
 from dejavu_torch.model import DejaVu, features_per_frame, require_map
 from dejavu_torch.model_file import ModelState, Recipe, difference, recipe_of, run_key, weights_of
 from dejavu_torch.motion.resampling import ResampledTraverse, source_of
+from dejavu_torch.places.frame_table import FrameTable
+from dejavu_torch.places.layout import agree
+from dejavu_torch.places.positions import positions_behind
 from dejavu_torch.recognition.calibration import strictest
 from dejavu_torch.teaching import FEWEST, calibrate_by, place_drives
 from dejavu_torch.types import InputError, Traverse, expect
@@ -33,8 +32,6 @@ from dejavu_torch.types import InputError, Traverse, expect
 log = logging.getLogger("dejavu_torch")
 
 EXACT = 2**24  # maximum number of even steps, with exact positions in float32
-SPARSE = 4  # a grown area may span so many times as many rows x columns as it has windows
-NORTH, STRIDE = 1.0, 1e-3  # degrees that areas of one map may differ by, and share of a step
 
 
 @torch.no_grad()
@@ -45,15 +42,18 @@ def append(
     checkpoint: learning.Checkpoint | None = None,
     map_tasks: learning.MapTasks = map,
     visits: LabelledFrames | None = None,
+    route: str | None = None,
 ) -> DejaVu:
     """Append the places of a traverse to a model's map, whose own places stay unchanged.
 
     Args:
-        model: with a spectral map of one route.
+        model: with a spectral map.
         traverse: frames like the map's. If the map's places are even steps along the ground, the traverse is
             resampled likewise, and its first frame is the next place.
         progress, checkpoint, map_tasks: see `DejaVu.learn`.
         visits: frames of another traverse of the new places, averaged in before coding, see `learn_mean`.
+        route: the one of a merged map that goes on; None is the only one. Its new places are the last of the
+            map, so that no place gets another number.
 
     Returns:
         The model, in eval mode, without its calibration, which was for fewer places. An error leaves it
@@ -73,33 +73,40 @@ def append(
         >>> append(model, wave[400:]).localize(wave[[50, 450]]).index
         tensor([ 50, 450])
     """
-    place_map = one_route(model, "append to")
+    place_map = spectral_map(model, "append to")
+    layout = place_map.layout
+    if route is None:
+        layout.expect_one("one of them by its name, as --route NAME")
+    number = 0 if route is None else layout.number(route)
     added = model.resample(as_traverse(traverse), model.step, progress, model.frame_shape)
     _check_compatible(model, added)
     places = len(added)
     positions = learning.positions_of(added).to(place_map.device)
     _check_count(place_map.places + places, model.step is not None)
-    area = continued(place_map.area, added.area, added.name)
-    if area is not None and model.frame_shape not in (None, added.frame_shape):
+    longer = place_map.table.counted.grown(added.layout, added.name, len(positions) or None, number)
+    if len(added.frame_shape) == 3 and model.frame_shape not in (None, added.frame_shape):
         seen, own = (" x ".join(map(str, shape or ())) for shape in (added.frame_shape, model.frame_shape))
-        raise InputError(f"{added.name} has windows of {seen}; expected {own}, as the map's")
+        expected = f"{own}, as the map's"
+        added.layout.expect_route(expected, f"{added.name} has windows of {seen}")
     counts = None
     if visits is not None:
         _check_compatible(model, visits.traverse)
         counts = learning.observation_counts(visits, places)
     grown = copy.deepcopy(place_map)
-    grown.area = area
-    grown.positions = place_map.positions[:0]  # set when all places are appended
+    grown.laid_out(longer).positions = place_map.positions[:0]  # set when all places are appended
     if checkpoint is not None:
         base = digests(base=checksums(place_map.packed(), place_map.get_extra_state()))
         checkpoint.open(run_key(model, added, visits=visits) | base, grown, model.descriptor)
     settings = visits, progress, checkpoint, map_tasks
+    grown.laid_out(longer)
     learning.append_places(grown, model.descriptor, added, place_map.places, *settings)
     if counts is not None:
         before = grown.visit_counts
         grown.count_visits(before + F.pad(counts.to(before), (place_map.places, 0)))
     if len(positions):
-        grown.positions = torch.cat([place_map.positions, positions_behind(positions, place_map.places)])
+        if len(longer.runs) == len(layout.runs):  # those of a run are counted through it
+            positions = positions_behind(positions, layout.runs[-1].places)
+        grown.positions = torch.cat([place_map.positions, positions])
     grown.check()
     frames = len(positions) or places
     names = [model.frame_names, [*source_of(added).names]]
@@ -174,7 +181,7 @@ def average(model: DejaVu, visits: LabelledFrames, progress: bool = False) -> in
         return encode_chunk(means, place_map.means[0], chunk.step, *settings)
 
     mean = place_map.of_chunks(averaged(g, chunk) for g, chunk in enumerate(place_map.coded()))
-    mean.positions, mean.area = place_map.positions, place_map.area
+    mean.laid_out(place_map.layout).positions = place_map.positions
     mean.count_visits((counts + seen).to(place_map.visits.device))
     mean.check()
     model.replace_map(mean)
@@ -221,9 +228,11 @@ def visit_to_calibrate(
     """As `associate`, but where a smoother has to place the visit, that is left to the map it calibrates."""
     option = "--calibration_truth"
     visit, places = _known_places(model, reference, visit, truth, option)
-    area = model.map.area if reference is None else reference.area
-    expect(places is not None or area is None, _placeable(option), f"{visit.name} shows an area, not a route")
-    return visit if places is None else LabelledFrames(visit, places)
+    if places is not None:
+        return LabelledFrames(visit, places)
+    layout = model.map.layout if reference is None else reference.layout
+    layout.expect_route(_placeable(option), f"{visit.name} shows an area, not a route")
+    return visit
 
 
 def _placeable(option: str) -> str:
@@ -242,12 +251,12 @@ def _known_places(
     smoother has to."""
     if reference is None:
         place_map, shape, step = one_route(model, "average visits into"), model.frame_shape, model.step
-        table, area, name, source = place_map.table, place_map.area, "the map", None
+        table, name, source = place_map.table, "the map", None
     else:
-        table = FrameTable(len(reference), learning.positions_of(reference))
+        table = FrameTable(reference.layout, learning.positions_of(reference))
         shape = model.at_map_size(reference, model.frame_shape if model.map.places else None).frame_shape
         step, name, source = getattr(reference, "step", None), reference.name, source_of(reference)
-        area = reference.area
+    layout = table.layout
     second = model.resample(second, step, shape=shape)
     frames = len(second)
     numbers = second.frame if isinstance(second, ResampledTraverse) else frames
@@ -255,10 +264,10 @@ def _known_places(
         truth, source, source_of(second), table.frames, numbers, resampled=step is not None, counters=False
     )
     shown = source_of(second).coordinates
-    if truth is None and area is not None and area.frame and shown is not None and not shown.degrees:
-        seen = f"coordinates of {second.name} in {shown.frame} and of {name} in {area.frame}"
-        expect(agree(shown.frame, area.frame), "one system", seen)
-        places = area.place_near(shown.values[:, :2])
+    if truth is None and layout.frame and shown is not None and not shown.degrees:
+        seen = f"coordinates of {second.name} in {shown.frame} and of {name} in {layout.frame}"
+        expect(agree(shown.frame, layout.frame), "one system", seen)
+        places = layout.place_near(shown.values[:, :2])
     elif ground_truth is not None:
         places = table.place_of(ground_truth.positives[:, 0])
     elif reference is None and step is None and names_agree(model.frame_names, second, counters=False):
@@ -332,10 +341,15 @@ def calibrate_if_possible(
 
 def one_route(model: DejaVu, verb: str) -> SpectralMap:
     """The spectral map of a model; InputError if it has none, another kind, or one of several routes."""
+    place_map = spectral_map(model, verb)
+    place_map.layout.expect_one(f"to {verb} the map of a route, then merge")
+    return place_map
+
+
+def spectral_map(model: DejaVu, verb: str) -> SpectralMap:
+    """The spectral map of a model; InputError if it has none, or another kind."""
     require_map(model, f" to {verb}")
     place_map = model.map
-    seen = f"the map has the routes {', '.join(route.name for route in place_map.routes)}"
-    expect(not place_map.routes, f"to {verb} the map of a route, then merge", seen)
     if not isinstance(place_map, SpectralMap):
         seen = (
             f"there is a map of kind {place_map.kind!r}; expected one of kind {SpectralMap.kind!r} to {verb}"
@@ -371,20 +385,23 @@ def merge(models: Sequence[DejaVu], names: Sequence[str]) -> DejaVu:
     """
     seen = f"{len(models)} maps and {len(names)} names to merge"
     expect(len(models) >= 2 and len(names) == len(models), "at least two maps, and a name for each", seen)
-    first, parts = models[0], dict[str, SpectralMap]()
+    first, maps, routes, taken = models[0], list[SpectralMap](), list[list[str]](), set[str]()
     for name, model in zip(names, models, strict=True):
         place_map = model.map
         if not isinstance(place_map, SpectralMap) or not place_map.places:
             seen = f"a map of kind {place_map.kind!r}" if place_map.places else "no map"
             raise InputError(f"{name} is {seen}; expected one of kind {SpectralMap.kind!r} to merge")
-        seen = f"{name} is the map of {_kind(place_map.area)}, {names[0]} of {_kind(first.map.area)}"
-        expect((place_map.area is None) == (first.map.area is None), "all of routes or of areas", seen)
+        layout, own = place_map.layout, first.map.layout
+        seen = f"{name} is the map of {layout.kind}, {names[0]} of {own.kind}"
+        expect(layout.kind == own.kind, "all of routes or of areas", seen)
         if problem := _difference(first, model):
             raise InputError(f"{names[0]} and {name} cannot be merged: {problem}")
-        maps = [(route.name, place_map.part(route.name)) for route in place_map.routes] or [(name, place_map)]
-        for wanted, part in maps:
-            parts[free_name(wanted, parts)] = part
-    _check_count(sum(part.places for part in parts.values()), first.step is not None)
+        maps.append(place_map)
+        routes.append([])
+        for wanted in layout.names(name):
+            routes[-1].append(free_name(wanted, taken))
+            taken.add(routes[-1][-1])
+    _check_count(sum(one.places for one in maps), first.step is not None)
     thresholds, precisions = ({getattr(one, name) for one in models} for name in ("threshold", "precision"))
     calibration = strictest([model.calibration for model in models])
     precision = first.precision if calibration is not None and len(precisions) == 1 else None
@@ -407,14 +424,14 @@ def merge(models: Sequence[DejaVu], names: Sequence[str]) -> DejaVu:
         log.warning(
             "the merged map has no %s: the routes differ in that, or one has none", ", ".join(dropped)
         )
-    place_map = SpectralMap.merged([*parts.values()], [*parts])
+    joined = SpectralMap.merged(maps, routes)
     starts = accumulate(model.map.places for model in models)
     links = [
         (one + start, two + start, share)
-        for model, start in zip(models, [0, *starts], strict=False)
-        for one, two, share in model.map.connections
+        for place_map, start in zip(maps, [0, *starts], strict=False)
+        for one, two, share in place_map.known_links
     ]
-    merged.replace_map(place_map.linked(links) if links else place_map)
+    merged.replace_map(joined.linked(links) if links else joined)
     merged.calibration = calibration
     return merged
 
@@ -425,15 +442,12 @@ def only_route(model: DejaVu, name: str) -> DejaVu:
     Raises:
         InputError: no merged map, or no route of this name.
     """
-    place_map, calibration, names = model.map, model.calibration, model.frame_names
-    if not isinstance(place_map, SpectralMap) or not place_map.routes:
-        raise InputError(f"route {name!r} of a map of one route; expected one of `dejavu merge`")
-    part = place_map.part(name)
-    before = [route.name for route in place_map.routes].index(name)
-    first = sum(route.frames for route in place_map.routes[:before])
-    model.replace_map(part)
+    model.map.layout.expect_several("one of `dejavu merge`", f"route {name!r} of a map of one route")
+    place_map, calibration, names = spectral_map(model, "find"), model.calibration, model.frame_names
+    shown = place_map.table.frames_in(place_map.layout.number(name)).tolist()
+    model.replace_map(place_map.part(name))
     model.calibration = calibration
-    model.state.frame_names = names[first : first + place_map.routes[before].frames]
+    model.state.frame_names = [names[frame] for frame in shown] if names else []
     return model
 
 
@@ -468,10 +482,8 @@ def _difference(first: DejaVu, other: DejaVu) -> str:
         return (
             "different drives have refined them; expected maps that no drive refined, or that share a stage"
         )
-    if first.map.area is not None and other.map.area is not None:
-        mine, yours = first.map.area, other.map.area
-        if seen := _unlike(mine, yours):
-            return f"{seen}; expected the same"
+    if seen := first.map.layout.unlike(other.map.layout):
+        return f"{seen}; expected the same"
     shapes = first.frame_shape, other.frame_shape
     if None not in shapes and not _compatible(first, *shapes):  # type: ignore[arg-type]
         sizes = " and ".join(" x ".join(map(str, shape or ())) for shape in shapes)
@@ -484,57 +496,6 @@ def joined_names(parts: list[list[str]], frames: list[int]) -> list[str]:
     if not any(parts):
         return []
     return [name for part, count in zip(parts, frames, strict=True) for name in part or [""] * count]
-
-
-def continued(area: Area | None, other: Area | None, name: str) -> Area | None:
-    """The area of a map and more windows of the same ground, where their coordinates put them; None of a
-    route.
-
-    Args:
-        other: of a traverse. name: of it, for messages.
-
-    Raises:
-        InputError: a route and an area, other distances between windows, windows of both at one place, or
-            areas far apart.
-    """
-    if area is None or other is None:
-        seen = f"{name} is {_kind(other)}, the map is of {_kind(area)}"
-        expect(area is other, "a route for a route, an area for an area", seen)
-        return None
-    seen = _unlike(area, other)
-    expect(not seen, "the same", f"{name} does not continue the map: {seen}")
-    own = area.rectangles[0]
-    steps, ends = (
-        torch.tensor(pair, dtype=torch.float64) for pair in ((own.down, own.right), (own.first, other.first))
-    )
-    away = ends[1] - ends[0]
-    row, column = (torch.linalg.solve(steps.T, away).round().long() + torch.tensor(own.corner)).tolist()
-    for (top, left), rows, columns in ((part.corner, part.rows, part.columns) for part in area.rectangles):
-        tall = min(row + other.rows, top + rows) - max(row, top)
-        wide = min(column + other.columns, left + columns) - max(column, left)
-        seen = f"{name} and the map share {tall} x {wide} windows"
-        expect(min(tall, wide) <= 0, "ground that the map lacks", seen)
-    joined = Area.of([*area.rectangles, other._replace(corner=(row, column))])
-    seen = f"{name} and the map lie in {joined.rows} x {joined.columns} windows, of which they have few"
-    expect(joined.rows * joined.columns <= SPARSE * joined.places, "areas nearby, or maps to merge", seen)
-    return joined
-
-
-def _unlike(one: Area, other: Area) -> str:
-    """Why windows of two areas cannot be in one map; "" if they can."""
-    if one.unit != other.unit or not agree(one.frame, other.frame):
-        return f"coordinates are in {one.frame or one.unit} and {other.frame or other.unit}"
-    for way in ("right", "down"):
-        mine, yours = (math.hypot(*getattr(area, way)) for area in (one, other))
-        if abs(mine - yours) > STRIDE * mine:
-            return f"windows are {mine:g} and {yours:g} {one.unit} apart"
-    if abs((one.north - other.north + 180) % 360 - 180) > NORTH:
-        return f"north is {one.north:g} and {other.north:g} degrees from up"
-    return ""
-
-
-def _kind(area: Area | None) -> str:
-    return "a route" if area is None else "an area"
 
 
 def _check_count(places: int, resampled: bool) -> None:

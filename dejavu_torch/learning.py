@@ -13,7 +13,6 @@ from typing import NoReturn, cast
 import torch
 from torch import Tensor
 
-from dejavu_torch.area import Area
 from dejavu_torch.data.traverse import Part
 from dejavu_torch.data.turning import Turned
 from dejavu_torch.features.descriptor import Descriptor
@@ -33,11 +32,12 @@ from dejavu_torch.features.views import (
 from dejavu_torch.features.whitening import STRENGTHS
 from dejavu_torch.maps.file import part_of, read_map, write_map
 from dejavu_torch.maps.place_map import Mapper, PlaceMap
-from dejavu_torch.maps.spectral import SpectralMapper, encode_chunk, line_sizes
+from dejavu_torch.maps.spectral import SpectralMapper, encode_chunk
 from dejavu_torch.maps.spectral_map import Chunk, SpectralMap
 from dejavu_torch.maps.spectrum import Transform
 from dejavu_torch.memory import concatenate, in_one_thread
 from dejavu_torch.motion.resampling import ResampledTraverse
+from dejavu_torch.places.layout import Layout
 from dejavu_torch.recognition.calibration import TOLERANCE, Calibration, calibrated
 from dejavu_torch.recognition.centring import learn_turned
 from dejavu_torch.text import progress_of
@@ -78,8 +78,7 @@ class ChunkEncoder:
             if self.visits is not None:
                 shown = views_of(self.visits, torch.arange(frames.start, frames.stop))
                 rows = averaged(self.descriptor, rows, shown)
-            area = self.traverse.area
-            columns = 1 if area is None else area.columns_from(frames.start)
+            columns = self.traverse.layout.columns_from(frames.start)
             return encode_chunk(rows, self.mean, self.step, self.transform, self.resolution, columns)
 
 
@@ -159,7 +158,7 @@ class Checkpoint:
 
 def is_long(traverse: Traverse, chunk: int) -> bool:
     """Whether a route with chunks of this many places is learned from a sample, chunk by chunk."""
-    return len(traverse) > (max(SAMPLE, chunk) if traverse.area is None else LARGE)
+    return len(traverse) > {1: max(SAMPLE, chunk), 2: LARGE}[traverse.layout.dimensions]
 
 
 @in_one_thread()
@@ -172,20 +171,19 @@ def fit(
     progress: bool = False,
 ) -> SpectralMap:
     """A map without places, but with whitening, mean and step from the sample of a long traverse."""
-    sample = Sample.of(len(traverse), mapper.chunk, traverse.area)
+    sample = Sample.of(traverse.layout, mapper.chunk)
     views = second and sample.views(second)
     frames = Blocks(traverse, sample.frame, sample.sizes)
     rows = descriptor.learn(frames, views, progress, verb="sampling")
-    if traverse.area is not None:
-        sample = Sample.of_tiles(traverse.area)
-        frames = Blocks(traverse, sample.frame, sample.sizes)
+    coded = Sample.of_chunks(traverse.layout, sample)
+    if coded is not sample:
+        sample, frames = coded, Blocks(traverse, coded.frame, coded.sizes)
         rows = torch.cat([*descriptor.batches(frames, progress, "sampling", shared=True)])
     if visits is not None:
         rows = averaged(descriptor, rows, views_of(visits, sample.frame), progress)
     # the sample is charged its share of the fixed bytes
     place_map = mapper.fit(rows, sample.sizes, len(rows) / len(traverse)).to(descriptor.device)
-    place_map.area = traverse.area
-    return place_map
+    return place_map.laid_out(traverse.layout)
 
 
 def append_places(
@@ -209,10 +207,11 @@ def append_places(
         InputError: frames that cannot be read, or a full disk; finished chunks are kept.
     """
     frames, settings = len(traverse), (place_map.transform, place_map.resolution)
-    encode = ChunkEncoder(traverse, descriptor, place_map.means[-1], place_map.step, *settings, visits)
+    route = int(place_map.layout.route_of(torch.tensor(start)))
+    encode = ChunkEncoder(traverse, descriptor, place_map.means[route], place_map.step, *settings, visits)
     done = range(place_map.places - start)
-    sizes = line_sizes(frames, place_map.chunk) if traverse.area is None else traverse.area.tiles
-    bounds = pairwise(accumulate((rows * columns for rows, columns in sizes), initial=0))
+    sizes = (rows * columns for rows, columns in traverse.layout.sizes(place_map.chunk))
+    bounds = pairwise(accumulate(sizes, initial=0))
     tasks = [range(*each) for each in bounds if each[0] >= len(done)]
     held: list[Chunk] = []
 
@@ -260,11 +259,14 @@ def turn_windows(place_map: SpectralMap, descriptor: Descriptor, traverse: Trave
 
 
 @torch.no_grad()
-def learn_descriptors(mapper: Mapper, descriptors: Tensor, area: Area | None = None) -> PlaceMap:
-    """The map of descriptors (N,K), of an area if one is given; a map of other sizes is refused."""
-    seen = f"{type(mapper).__name__}, and an area of {len(descriptors)} places"
-    expect(area is None or isinstance(mapper, SpectralMapper), "a SpectralMapper for an area", seen)
-    place_map: PlaceMap = mapper(descriptors) if area is None else mapper(descriptors, area)
+def learn_descriptors(mapper: Mapper, descriptors: Tensor, layout: Layout) -> PlaceMap:
+    """The map of descriptors (N,K), whose places lie so; a map of other sizes is refused."""
+    if isinstance(mapper, SpectralMapper):
+        place_map: PlaceMap = mapper(descriptors, layout)
+    else:
+        seen = f"{type(mapper).__name__}, and an area of {len(descriptors)} places"
+        layout.expect_route("a SpectralMapper for an area", seen)
+        place_map = mapper(descriptors).laid_out(layout)
     if (place_map.places, place_map.dimension) != tuple(descriptors.shape):
         seen = f"{place_map.places} places and {place_map.dimension} features"
         seen = f"{type(mapper).__name__} made a map of {seen}"

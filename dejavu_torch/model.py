@@ -16,7 +16,6 @@ from torch import Tensor, nn
 from torch.nn.parameter import is_lazy
 
 from dejavu_torch import learning, model_file
-from dejavu_torch.area import Area
 from dejavu_torch.data.source import Source, as_traverse
 from dejavu_torch.data.traverse import at_size, resize_like, size_like
 from dejavu_torch.data.turning import Turned, facing_north
@@ -33,6 +32,7 @@ from dejavu_torch.maps.summary import MapSummary
 from dejavu_torch.maps.weights import BITS, round_weights
 from dejavu_torch.motion.odometry import GroundOdometry
 from dejavu_torch.motion.resampling import ResampledTraverse, resampled, source_of
+from dejavu_torch.places.layout import ROUTE, Layout
 from dejavu_torch.recognition.centring import PRIOR, centred, set_apart
 from dejavu_torch.recognition.coarse import searcher
 from dejavu_torch.recognition.filter import PlaceFilter
@@ -239,6 +239,7 @@ class DejaVu(nn.Module):
                     place_map = learning.fit(mapper, descriptor, traverse, second, visits, progress)
                 else:
                     descriptor.adapt(traverse, resumed=True)
+                    place_map.laid_out(traverse.layout)
                 settings = visits, progress, checkpoint, map_tasks
                 learning.append_places(place_map, descriptor, traverse, 0, *settings)
                 learned: PlaceMap = place_map
@@ -248,7 +249,7 @@ class DejaVu(nn.Module):
                 rows = descriptor.learn(traverse, second, progress, isinstance(mapper, SpectralMapper))
                 if visits is not None:
                     rows = learning.averaged(descriptor, rows, visits, progress)
-                learned = learning.learn_descriptors(mapper, rows, traverse.area)
+                learned = learning.learn_descriptors(mapper, rows, traverse.layout)
             if counts is not None:
                 learned.count_visits(learned.visit_counts + counts.to(learned.device))
             learning.count_drives(learned, second)
@@ -259,7 +260,7 @@ class DejaVu(nn.Module):
         features: Tensor,
         traverse: Traverse | None = None,
         second: LabelledFrames | None = None,
-        area: Area | None = None,
+        layout: Layout = ROUTE,
     ) -> DejaVu:
         """As `learn`, from ready descriptors.
 
@@ -268,10 +269,10 @@ class DejaVu(nn.Module):
             traverse: their source, if known: it tells the map which frames to expect, and the frame of each
                 resampled place.
             second: what the whitening has learned from; the map tells how many drives taught it.
-            area: of the places, if they are in rows and columns and the traverse does not say so.
+            layout: where the places lie, such as in rows and columns; without a traverse, which knows it.
         """
-        area = area if traverse is None or traverse.area is None else traverse.area
-        learned = learning.learn_descriptors(self.mapper, features, area)
+        layout = layout.reaching(len(features)) if traverse is None else traverse.layout
+        learned = learning.learn_descriptors(self.mapper, features, layout)
         learning.count_drives(learned, second)
         return self.replace_map(learned, _state_of(self, learned, traverse))
 
@@ -435,7 +436,7 @@ class DejaVu(nn.Module):
             match = localizer(descriptors, progress)
             late = isinstance(smoother, PlaceFilter) and smoother.lag
             return Match.joined([match, localizer.finish()]) if late else match
-        matcher = Localizer(None, matching, area=self.map.area)
+        matcher = Localizer(None, matching, layout=self.map.layout)
         parts = descriptors.split(whole(SCORES_AT_ONCE // self.map.places, matching.copies))
         with torch.no_grad():
             scores = map(score, with_progress(parts, "localizing", progress))
@@ -455,7 +456,7 @@ class DejaVu(nn.Module):
             InputError: another traverse than the map's, or `apart` out of range.
         """
         require_map(self)
-        check_loops_along(self.map.area)
+        check_loops_along(self.map.layout)
         traverse = self.at_map_size(as_traverse(traverse), self.frame_shape or ())
         if self.step is not None:
             traverse = self.resample(traverse, self.step, progress, self.frame_shape)
@@ -484,9 +485,10 @@ class DejaVu(nn.Module):
         require_map(self)
         check_search(matching.search)
         if matching.sequence is not None:
-            fits = self.map.area is None or isinstance(matching.sequence, PlaceSmoother | PlaceFilter)
-            seen = f"{type(matching.sequence).__name__}, and the map of an area"
-            expect(fits, "single images (--match single), a PlaceFilter or a PlaceSmoother", seen)
+            if not isinstance(matching.sequence, PlaceSmoother | PlaceFilter):
+                expected = "single images (--match single), a PlaceFilter or a PlaceSmoother"
+                seen = f"{type(matching.sequence).__name__}, and the map of an area"
+                self.map.layout.expect_route(expected, seen)
             matching.sequence.check(None, self.map.places)
         single = matching.sequence is None and matching.callback is None
         if not single or matching.search not in ("auto", "coarse"):
@@ -521,7 +523,7 @@ class DejaVu(nn.Module):
             sequence.check(len(queries), self.map.places)
         if self.step is not None:
             queries = self.resample(queries, self.step, progress, self.frame_shape)
-        queries = facing_north(queries, self.map.area, headings)
+        queries = facing_north(queries, self.map.layout, headings)
         shape, name = queries.frame_shape, queries.name
 
         def on_first(frames: Tensor, features: Tensor) -> None:
@@ -658,7 +660,7 @@ def _state_of(model: DejaVu, place_map: PlaceMap, traverse: Traverse | None) -> 
         log.warning(line, place_map.dimension)
     if len(shape) == 1 and (model.preprocess.channel or model.preprocess.contrast):
         log.warning("these are ready features: channel and contrast have no effect")
-    if isinstance(place_map, SpectralMap) and place_map.area is not None and len(shape) == 3:
+    if isinstance(place_map, SpectralMap) and place_map.layout.has_north and len(shape) == 3:
         learning.turn_windows(place_map, model.descriptor, traverse)
     if len(positions):
         place_map.positions = positions.to(place_map.device)
@@ -681,9 +683,9 @@ def features_per_frame(model: DejaVu) -> int:
     return sum(whitening.sizes) if whitening is not None and whitening.learned else model.map.dimension
 
 
-def check_loops_along(area: Area | None) -> None:
+def check_loops_along(layout: Layout) -> None:
     """Refuse loops over an area, whose numbers of places say nothing of when they were passed."""
-    expect(area is None, "a route", "loops on the map of an area")
+    layout.expect_route("a route", "loops on the map of an area")
 
 
 def check_apart(apart: int, places: int) -> None:

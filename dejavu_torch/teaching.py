@@ -144,7 +144,7 @@ def described(model: DejaVu, drive: Source, verb: str, progress: bool = False) -
     """A drive, resampled as the map is, and its descriptors (Q,K); refuses one that does not fit."""
     require_map(model, f" to {verb}")
     place_map = model.map
-    expect(place_map.area is None, "that of a route", f"this is the map of an area to {verb}")
+    place_map.layout.expect_route("that of a route", f"this is the map of an area to {verb}")
     if not isinstance(place_map, SpectralMap):
         raise InputError(f"the map is of kind {place_map.kind!r}; expected one of kind 'spectral' to {verb}")
     traverse = model.resample(as_traverse(drive), model.step, progress, model.frame_shape)

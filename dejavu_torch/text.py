@@ -16,11 +16,33 @@ if TYPE_CHECKING:
 Step = TypeVar("Step")
 TOLD = 20  # times as much as is done, in all, for a line to tell the time that is left
 FIRST_LINE, LINE_EVERY = 30.0, 60.0  # seconds until the first line of progress, and between lines
+LONGEST_MESSAGE = 2000  # characters
 
 
 def printable(text: object) -> str:
     """The text as one line: characters neither printable nor a space, such as line breaks, are escaped."""
     return "".join(c if c.isprintable() or category(c) == "Zs" else ascii(c)[1:-1] for c in str(text))
+
+
+class InputError(ValueError):
+    """Bad input. The message is one printable line of limited length: what was seen and what was expected."""
+
+    def __init__(self, message: object) -> None:
+        text = printable(message)
+        if len(text) > LONGEST_MESSAGE:
+            text = f"{text[: LONGEST_MESSAGE // 2]} ... {text[-LONGEST_MESSAGE // 2 :]}"
+        super().__init__(text)
+
+
+def expect(fits: object, to_be: object, seen: object = "", /, **given: object) -> None:
+    """Refuse bad input unless it `fits`: "`seen`; expected `to_be`", where `given` reads "name is value".
+
+    Example:
+        >>> expect(2 > 1, "at least 1", k=2)
+    """
+    if not fits:
+        pairs = ((name, f"a {x.__name__}" if isinstance(x, type) else repr(x)) for name, x in given.items())
+        raise InputError(f"{seen or ' and '.join(map(' is '.join, pairs))}; expected {to_be}")
 
 
 def plain_number(number: object) -> int | float:

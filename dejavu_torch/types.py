@@ -18,38 +18,18 @@ from torch import Tensor, nn
 from torch.utils.data import Dataset
 from typing_extensions import Self
 
-from dejavu_torch.area import Area
+from dejavu_torch.places.layout import ROUTE, Layout
+from dejavu_torch.text import InputError as InputError
+from dejavu_torch.text import expect as expect
 from dejavu_torch.text import printable
 
 BATCH_NUMBERS = 2**26  # values in a batch of more than one frame: 256 MB
 BATCH_SIZE = 64  # frames read at a time by default
 FRAME_NUMBERS = 2**28  # values in one frame: 1 GB
-LONGEST_MESSAGE = 2000  # characters
 
 Facts: TypeAlias = dict[str, Any]  # what JSON holds, settings and other values of many types, by name
 # T queries in a sequence, all so far in a filter, or all of the drive in a smoother
 Together = int | Literal["filter", "smoother"]
-
-
-class InputError(ValueError):
-    """Bad input. The message is one printable line of limited length: what was seen and what was expected."""
-
-    def __init__(self, message: object) -> None:
-        text = printable(message)
-        if len(text) > LONGEST_MESSAGE:
-            text = f"{text[: LONGEST_MESSAGE // 2]} ... {text[-LONGEST_MESSAGE // 2 :]}"
-        super().__init__(text)
-
-
-def expect(fits: object, to_be: object, seen: object = "", /, **given: object) -> None:
-    """Refuse bad input unless it `fits`: "`seen`; expected `to_be`", where `given` reads "name is value".
-
-    Example:
-        >>> expect(2 > 1, "at least 1", k=2)
-    """
-    if not fits:
-        pairs = ((name, f"a {x.__name__}" if isinstance(x, type) else repr(x)) for name, x in given.items())
-        raise InputError(f"{seen or ' and '.join(map(' is '.join, pairs))}; expected {to_be}")
 
 
 def check_shape(x: Tensor, dims: str, name: str) -> None:
@@ -88,8 +68,7 @@ class Traverse(Dataset[Tensor], ABC):
         ordered: whether they are known to be consecutive, as in a video; see the filter and sequences.
         sized: whether the user asked for their size, as with `width=` of a video.
         deep: whether its images have more than 8 bits a pixel.
-        area: the rows and columns of windows over an area, whose places are numbered as in `Area`; None along
-            a route.
+        layout: where its frames lie, if they become the places of a map: along a route, or over an area.
         cut: of windows of one long image, its size, the window's, and their range; equal: the same places.
 
     Raises:
@@ -111,11 +90,24 @@ class Traverse(Dataset[Tensor], ABC):
     ordered: bool = False
     sized: bool = False
     cut: tuple[tuple[int, ...], range] | None = None
-    area: Area | None = None
+    _layout: Layout = ROUTE
 
     @property
     def deep(self) -> bool:
         return False
+
+    @property
+    def layout(self) -> Layout:
+        return self._layout.reaching(len(self))
+
+    @layout.setter
+    def layout(self, layout: Layout) -> None:
+        self._layout = layout
+
+    @property
+    def area(self) -> Layout | None:
+        """The layout of an area; None along a route."""
+        return self.layout.area
 
     @abstractmethod
     def __len__(self) -> int: ...

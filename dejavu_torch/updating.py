@@ -12,12 +12,12 @@ from torch import Tensor
 
 from dejavu_torch.data.source import Source
 from dejavu_torch.growth import free_name, joined_names
-from dejavu_torch.maps.frame_table import Link
 from dejavu_torch.maps.place_map import PlaceMap
 from dejavu_torch.maps.spectral import encode_chunk
 from dejavu_torch.maps.spectral_map import SpectralMap
 from dejavu_torch.model import DejaVu
 from dejavu_torch.motion.resampling import ResampledTraverse, source_of
+from dejavu_torch.places.states import Link
 from dejavu_torch.recognition.calibration import TOLERANCE
 from dejavu_torch.recognition.drive import Answers, DriveQuery, answer_drives
 from dejavu_torch.recognition.evidence import spacing_of
@@ -118,9 +118,9 @@ def update(
         if refined:
             refined.into(model)
         return Update(refinement, True, unknown=tuple(unknown))
-    grown, links, names, shown = place_map, [*place_map.connections], [], [model.frame_names]
+    grown, links, names, shown = place_map, [*place_map.known_links], [], [model.frame_names]
     for first, last in stretches:
-        taken = {own, *(route.name for route in grown.routes)}
+        taken = {own, *grown.layout.routes}
         names.append(free_name(name or Path(traverse.name).stem or traverse.name, taken))
         joins, back = _joins(answers, (first, last), grown)
         links += joins

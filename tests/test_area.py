@@ -27,18 +27,18 @@ from dejavu_torch import (
     compare,
     open_source,
 )
-from dejavu_torch.area import Area
 from dejavu_torch.data.grid import Grid
 from dejavu_torch.evaluation.baselines import stored_frames
 from dejavu_torch.features.views import Sample
 from dejavu_torch.maps.spectral_map import SpectralMap
 from dejavu_torch.maps.spectrum import by_frequency, frequencies, from_lines, lines_of
+from dejavu_torch.places.layout import Layout, Rectangle
 from dejavu_torch.recognition import flight as flights
 from dejavu_torch.recognition.coarse import CoarseSearch, SamplingPlan
 from dejavu_torch.recognition.evidence import RankTable, standardised
 from dejavu_torch.recognition.localizer import Matching
 from dejavu_torch.recognition.motion import Rates
-from dejavu_torch.recognition.plane import Followed, PlaneMotion, as_plane, by_place, near_in_plane
+from dejavu_torch.recognition.plane import Followed, PlaneMotion
 from dejavu_torch.recognition.samples import RowSearch
 from dejavu_torch.recognition.search import Scan
 from dejavu_torch.recognition.select import best_candidates
@@ -68,7 +68,7 @@ def learned(area, transform="dft", step=0.02, seed=0):
 def test_every_window_is_one_place_and_a_tile_is_a_run_of_places(rows, columns, side):
     before, areas.SIDE = areas.SIDE, side
     try:
-        area = Area(rows, columns)
+        area = Layout(rows, columns)
         places = torch.arange(area.places)
         cells = area.cells(places)
         assert {(r, c) for r in range(rows) for c in range(columns)} == {*map(tuple, cells.tolist())}
@@ -87,25 +87,25 @@ def test_every_window_is_one_place_and_a_tile_is_a_run_of_places(rows, columns, 
 def test_values_by_place_are_a_plane_row_by_row(rows, columns, side):
     before, areas.SIDE = areas.SIDE, side
     try:
-        area, values = Area(rows, columns), torch.randn(2, rows * columns)
-        plane = as_plane(values, area)
+        area, values = Layout(rows, columns), torch.randn(2, rows * columns)
+        plane = area.as_plane(values)
         cells = area.cells(torch.arange(area.places))
         assert torch.equal(plane[:, cells[:, 0], cells[:, 1]], values)
-        assert torch.equal(by_place(plane, area), values)
+        assert torch.equal(area.by_place(plane), values)
     finally:
         areas.SIDE = before
 
 
 def test_orders_from_inference_serve_training():
-    area, values = Area(7, 5, first=(0.5, 0.5)), torch.randn(1, 35, requires_grad=True)
+    area, values = Layout(7, 5, first=(0.5, 0.5)), torch.randn(1, 35, requires_grad=True)
     with torch.inference_mode():
-        as_plane(values.detach(), area)
-    by_place(as_plane(values, area).square(), area).sum().backward()
+        area.as_plane(values.detach())
+    area.by_place(area.as_plane(values).square()).sum().backward()
     torch.testing.assert_close(values.grad, 2 * values.detach())
 
 
 def test_columns_of_candidates_have_coordinates_without_a_warning():
-    index, area = torch.arange(20).view(10, 2), Area(3, 8)
+    index, area = torch.arange(20).view(10, 2), Layout(3, 8)
     torch.set_warn_always(True)
     try:
         with warnings.catch_warnings():
@@ -117,7 +117,7 @@ def test_columns_of_candidates_have_coordinates_without_a_warning():
 
 
 def test_neighbours_are_those_in_the_plane(small_tiles):
-    area = Area(13, 17)
+    area = Layout(13, 17)
     place = area.place_at(torch.tensor([[5, 5], [0, 16]]))
     near = area.around(place, 2)
     for one, found in zip(place, near, strict=True):
@@ -150,7 +150,7 @@ def test_a_wave_over_the_plane_is_one_line():
 
 @pytest.mark.parametrize("transform", ["dft", "dct"])
 def test_the_map_of_an_area_scores_as_its_descriptors(small_tiles, transform):
-    area = Area(13, 17)
+    area = Layout(13, 17)
     place_map, own = learned(area, transform)
     assert [place_map.size_of(g) for g in range(len(place_map.chunks))] == area.tiles
     decoded = torch.cat([place_map.decode(g) for g in range(len(place_map.chunks))])
@@ -166,7 +166,7 @@ def test_the_map_of_an_area_scores_as_its_descriptors(small_tiles, transform):
 
 
 def test_two_directions_take_fewer_bytes_than_one():
-    area = Area(40, 40)
+    area = Layout(40, 40)
     place_map, own = learned(area, step=0.3)
     rows = SpectralMapper(step=0.3, chunk=40)(own)  # one tile, row by row
     shuffled = SpectralMapper(step=0.3)(own[torch.randperm(len(own))], area)
@@ -176,7 +176,7 @@ def test_two_directions_take_fewer_bytes_than_one():
 
 def test_a_route_of_one_column_is_the_map_of_a_route():
     rows = smooth(50, 1)
-    place_map, route = SpectralMapper(step=0.1)(rows, Area(50, 1)), SpectralMapper(step=0.1)(rows)
+    place_map, route = SpectralMapper(step=0.1)(rows, Layout(50, 1)), SpectralMapper(step=0.1)(rows)
     assert torch.equal(place_map.streams, route.streams)
     assert not len(place_map.columns)
 
@@ -184,7 +184,7 @@ def test_a_route_of_one_column_is_the_map_of_a_route():
 @pytest.mark.parametrize("transform", ["dft", "dct"])
 def test_samples_are_low_passed_in_both_directions(small_tiles, transform, monkeypatch):
     monkeypatch.setattr(areas, "SIDE", 20)
-    place_map, _ = learned(Area(40, 37), transform, step=0.01)
+    place_map, _ = learned(Layout(40, 37), transform, step=0.01)
     for chunk in range(len(place_map.chunks)):
         decoded = place_map.decode(chunk)
         torch.testing.assert_close(place_map.samples(chunk, 1), decoded, rtol=0, atol=1e-4)
@@ -194,17 +194,17 @@ def test_samples_are_low_passed_in_both_directions(small_tiles, transform, monke
 
 def test_searches_find_what_a_scan_finds(small_tiles, monkeypatch):
     monkeypatch.setattr(areas, "SIDE", 16)
-    place_map, own = learned(Area(48, 50), step=0.05)
+    place_map, own = learned(Layout(48, 50), step=0.05)
     queries = own[::37] + 0.02 * torch.randn(len(own[::37]), own.shape[1])
     wanted = [(3, 2), (2, 5)]
     scan = Scan(place_map)
     for search in (RowSearch(place_map), CoarseSearch(place_map, SamplingPlan(2, 1, 64, 1.0, 0))):
         for spec in wanted:
             score, place = search(queries, wanted)
-            found = best_candidates(score, *spec, place, place_map.area)
-            best = best_candidates(place_map.scores(queries), *spec, area=place_map.area)
+            found = best_candidates(score, *spec, place, place_map.layout)
+            best = best_candidates(place_map.scores(queries), *spec, layout=place_map.layout)
             exact = best_candidates(
-                *(scan(queries, wanted)[0], *spec, scan(queries, wanted)[1]), place_map.area
+                *(scan(queries, wanted)[0], *spec, scan(queries, wanted)[1]), place_map.layout
             )
             assert torch.equal(exact.index, best.index)
             assert float((found.index[:, 0] == best.index[:, 0]).float().mean()) > 0.95
@@ -212,16 +212,16 @@ def test_searches_find_what_a_scan_finds(small_tiles, monkeypatch):
 
 
 def test_candidates_are_apart_in_the_plane(small_tiles):
-    area = Area(13, 17)
+    area = Layout(13, 17)
     scores = torch.rand(4, area.places)
-    found = best_candidates(scores, 4, 3, area=area)
+    found = best_candidates(scores, 4, 3, layout=area)
     for row in found.index:
         apart = area.distance(row[:, None], row) + 99 * torch.eye(4, dtype=torch.long)
         assert int(apart.min()) > 3
 
 
 def test_every_kth_window_is_stored_in_both_directions(small_tiles):
-    area = Area(13, 17)
+    area = Layout(13, 17)
     stored, nearest = stored_frames(area.places, 4, area)
     assert len(stored) == 4 * 5
     every = torch.arange(area.places)
@@ -244,7 +244,9 @@ def transitions(cells, kernel, jump, leave, enter):
     return step
 
 
-@pytest.mark.parametrize("area", [Area(7, 11), Area.of([Area(6, 11), Area(1, 7)._replace(corner=(6, 2))])])
+@pytest.mark.parametrize(
+    "area", [Layout(7, 11), Layout.of([Rectangle(6, 11), Rectangle(1, 7, corner=(6, 2))])]
+)
 def test_a_filter_moves_over_an_area(small_tiles, area):
     """Against matrices of all transitions."""
     assert len(area.tiles) > 1
@@ -281,7 +283,7 @@ def test_a_filter_finds_a_flight_on_the_way(small_tiles):
         return float((model.map.area.distance(match.index.clamp(min=0), truth) <= 2).double().mean())
 
     found = model.localize_descriptors(queries, filter)
-    assert filter.area is None  # of a filter that may belong to several maps
+    assert not filter.layout.places  # of a filter that may belong to several maps
     beside = model.localize_descriptors(queries, Matching(also={"filter": filter}))
     assert torch.equal(beside.sequences["filter"].index, found.index)
     assert near(found) > near(model.localize_descriptors(queries)) + 0.05
@@ -302,7 +304,9 @@ def test_a_filter_learns_the_course_of_a_flight():
     assert 5 < float(learned.sum()) < 20  # early moves are forgotten
 
 
-@pytest.mark.parametrize("area", [Area(4, 5), Area.of([Area(3, 5), Area(2, 2)._replace(corner=(-2, 3))])])
+@pytest.mark.parametrize(
+    "area", [Layout(4, 5), Layout.of([Rectangle(3, 5), Rectangle(2, 2, corner=(-2, 3))])]
+)
 def test_a_sweep_gives_the_masses_of_the_model(small_tiles, area):
     """Against matrices of all transitions between the windows, and the state off the area."""
     queries = 5
@@ -337,7 +341,7 @@ def test_a_sweep_gives_the_masses_of_the_model(small_tiles, area):
     for t in reversed(range(queries)):
         for own, found in ((forward[t], swept.mass[t]), (before[t], swept.others[t])):
             mass = own * message / (own * message).sum()
-            torch.testing.assert_close(mass[:n].float(), by_place(found[None], area)[0], rtol=1e-3, atol=1e-5)
+            torch.testing.assert_close(mass[:n].float(), area.by_place(found[None])[0], rtol=1e-3, atol=1e-5)
         message = message * seen[t]
         message = message if still[t] else step @ message
     assert swept.log == pytest.approx(total, abs=1e-3)
@@ -358,9 +362,9 @@ def flight(area, images, seed=0):
 
 def flown(step):
     """A model of an area, its descriptors, and the places of a flight over it."""
-    area = Area(30, 40)
+    area = Layout(30, 40)
     _, own = learned(area)
-    model = DejaVu(whitening="none", mapper=SpectralMapper(step=step)).learn_features(own, area=area)
+    model = DejaVu(whitening="none", mapper=SpectralMapper(step=step)).learn_features(own, layout=area)
     return model, own, flight(area, 90)
 
 
@@ -449,10 +453,10 @@ def test_an_area_is_compared_by_distance(pictures, small_tiles, tmp_path, monkey
     assert [row["place"] for row in again] == [row["place"] for row in rows]
 
 
-@pytest.mark.parametrize("area", [Area(5, 6), Area.of([Area(3, 5), Area(2, 2)._replace(corner=(3, 3))])])
+@pytest.mark.parametrize("area", [Layout(5, 6), Layout.of([Rectangle(3, 5), Rectangle(2, 2, corner=(3, 3))])])
 def test_a_window_at_a_border_is_chosen_by_its_own_mass(area):
     every = torch.eye(area.places)
-    near = near_in_plane(every, 2, area, weighted=True)
+    near = area.blurred(every, 2)
     assert torch.equal(near.argmax(1), torch.arange(area.places))
     away = area.cells(torch.arange(area.places))
     pyramid = (1 - (away[:, None] - away).abs() / 3).clamp(min=0).prod(2)
@@ -490,7 +494,7 @@ def test_other_truths_count_windows_around_the_right_one(pictures, small_tiles, 
 
 
 def test_the_map_of_an_area_is_exported(small_tiles):
-    place_map, own = learned(Area(13, 17))
+    place_map, own = learned(Layout(13, 17))
 
     class Scores(torch.nn.Module):
         def __init__(self):
@@ -505,7 +509,7 @@ def test_the_map_of_an_area_is_exported(small_tiles):
 
 
 def test_gradients_pass_a_map_that_was_first_used_without(small_tiles):
-    place_map, own = learned(Area(13, 17))
+    place_map, own = learned(Layout(13, 17))
     with torch.inference_mode():
         place_map.scores(own[:2])
     query = own[:2].clone().requires_grad_()
@@ -516,7 +520,7 @@ def test_gradients_pass_a_map_that_was_first_used_without(small_tiles):
 
 @given(rows=st.integers(1, 3000), columns=st.integers(1, 3000))
 def test_a_sample_of_an_area_reaches_its_borders(rows, columns):
-    sample = Sample.of_area(area := Area(rows, columns))
+    sample = Sample.of_area(area := Layout(rows, columns))
     cells = area.cells(sample.frame)
     assert len(sample.frame) == sum(tall * wide for tall, wide in sample.sizes)
     assert len(sample.frame) >= min(area.places, 2000)
@@ -527,8 +531,8 @@ def test_a_sample_of_an_area_reaches_its_borders(rows, columns):
 
 
 def test_narrow_areas_have_long_tiles():
-    assert len(Area(10_000, 1).tiles) == len(Area(1, 10_000).tiles) == 1
-    assert len(Area(10_000, 3).tiles) == len(Area(3, 10_000).tiles) == 2
+    assert len(Layout(10_000, 1).tiles) == len(Layout(1, 10_000).tiles) == 1
+    assert len(Layout(10_000, 3).tiles) == len(Layout(3, 10_000).tiles) == 2
 
 
 def test_a_large_area_is_learned_tile_by_tile(pictures, small_tiles, monkeypatch):
@@ -552,7 +556,7 @@ def test_what_a_map_of_an_area_does_not_do_is_refused(pictures, small_tiles):
     with refused("TemplateMapper", "area", "SpectralMapper"):
         DejaVu(mapper=TemplateMapper()).learn(source)
     with refused("100 descriptors", "10 x 11", "one for each"):
-        SpectralMapper()(smooth(10, 10), Area(10, 11))
+        SpectralMapper()(smooth(10, 10), Layout(10, 11))
 
 
 @pytest.mark.parametrize(

@@ -25,6 +25,7 @@ from dejavu_torch.learning import Checkpoint, Sample
 from dejavu_torch.maps.spectral import SpectralMapper
 from dejavu_torch.maps.spectral_map import SpectralMap
 from dejavu_torch.model import DejaVu
+from dejavu_torch.places.layout import Layout
 from dejavu_torch.types import FrequencyLayer
 
 CHUNK, PLACES = 50, 620
@@ -135,7 +136,7 @@ def test_what_cannot_be_made_is_named_and_what_precedes_it_is_kept(cluster, watc
     monkeypatch.setattr(clustering, "RETRIES", 0)
     bright = frames(PLACES, size=16)
     bright[444] = 255
-    assert not {110, 444} & set(Sample.of(PLACES, CHUNK).frame.tolist())
+    assert not {110, 444} & set(Sample.of_route(Layout(PLACES), CHUNK).frame.tolist())
     images = write_images(tmp_path / "route", bright)
     good = (images / "110.png").read_bytes()
     whole = file_of(learned(open_source(images), watched), tmp_path)
@@ -164,7 +165,7 @@ def test_what_cannot_be_made_is_named_and_what_precedes_it_is_kept(cluster, watc
 def test_chunks_made_together_before_a_bad_frame_are_kept(cluster, tmp_path):
     bad = route()
     bad[544] = torch.nan
-    assert 544 not in Sample.of(PLACES, CHUNK).frame
+    assert 544 not in Sample.of_route(Layout(PLACES), CHUNK).frame
     with refused("frames 500 to 599", "read on", "frame 544", "500 of 620"):
         learned(bad, checkpoint=Checkpoint(tmp_path / "m"), map_tasks=cluster.map)
 

@@ -22,7 +22,6 @@ import dejavu_torch.data.folder as folder
 import dejavu_torch.data.picture as pictures
 import dejavu_torch.memory as memory
 from dejavu_torch import DejaVu, SpectralMapper, compare, open_source
-from dejavu_torch.area import Ground
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.coordinates import coordinates_of, read_coordinates
 from dejavu_torch.data.flight import Flight
@@ -31,6 +30,7 @@ from dejavu_torch.data.grid import Grid
 from dejavu_torch.data.ground_truth import find_ground_truth
 from dejavu_torch.data.picture import Picture, read_picture
 from dejavu_torch.data.source import check_not_read
+from dejavu_torch.places.layout import Ground
 from dejavu_torch.resize import resize_frames
 from dejavu_torch.types import Coordinates
 

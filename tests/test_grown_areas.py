@@ -15,12 +15,18 @@ from test_area import ground
 
 import dejavu_torch.places.layout as areas
 from dejavu_torch import DejaVu, PlaceFilter, PlaceSmoother, SpectralMapper, open_source
-from dejavu_torch.area import Area, apart, area_of, stored_area
-from dejavu_torch.growth import append, associate, average, continued, merge
+from dejavu_torch.growth import append, associate, average, merge
 from dejavu_torch.maps.spectral_map import SpectralMap
-from dejavu_torch.recognition.plane import as_plane, by_place
+from dejavu_torch.places.layout import Layout, Rectangle
 
 WINDOWS = "window=48&stride=16"
+
+
+def changed(layout, **changes):
+    """A layout with other steps, unit or frame."""
+    known = {"unit": layout.unit, "frame": layout.frame} | changes
+    own = {name: known.pop(name) for name in changes if name in Rectangle._fields}
+    return Layout.of([one._replace(**own) for one in layout.rectangles], **known)
 
 
 @pytest.fixture
@@ -47,10 +53,10 @@ def several(draw):
     """An area of several rectangles of one ground that do not overlap."""
     found, row = [], 0
     for _ in range(draw(st.integers(1, 4))):
-        part = Area(draw(st.integers(1, 9)), draw(st.integers(1, 9)), first=(float(row), 3.0))
-        found.append(part._replace(corner=(row, draw(st.integers(-5, 5)))))
-        row += part.rows + draw(st.integers(0, 3))
-    return Area.of(found[::-1])
+        sides, corner = (draw(st.integers(1, 9)), draw(st.integers(1, 9))), (row, draw(st.integers(-5, 5)))
+        found.append(Rectangle(*sides, first=(float(row), 3.0), corner=corner))
+        row += sides[0] + draw(st.integers(0, 3))
+    return Layout.of(found[::-1], "px")
 
 
 @given(area=several())
@@ -67,24 +73,22 @@ def test_every_window_has_one_place(area):
         known = area.place_at(lattice) >= 0
         assert int(known.sum()) == area.places
         values = torch.randn(2, area.places)
-        assert torch.equal(by_place(as_plane(values, area), area), values)
+        assert torch.equal(area.by_place(area.as_plane(values)), values)
         for one, near in zip(places, area.around(places, 2), strict=True):
             assert {*near.tolist()} == {*places[area.distance(places, one) <= 2].tolist()}
         sizes = [part.places for part in area.rectangles]
         for part, own in zip(area.rectangles, places.split(sizes), strict=True):
-            alone = part._replace(corner=(0, 0))
+            alone = Layout.of([part], "px")
             assert torch.equal(area.coordinates(own), alone.coordinates(torch.arange(len(own))))
-            assert area.between(int(own[0]), int(own[-1]) + 1) == alone
-        assert area_of(json.loads(json.dumps(stored_area(area)))) == area
+        assert Layout.restored(json.loads(json.dumps(area.stored())), area.places) == area
 
 
 def test_areas_that_are_apart_are_not_near():
-    one, two = Area(4, 5, first=(7.0, 8.0)), Area.of([Area(2, 3), Area(2, 2, corner=(2, 0))])
-    both = apart([one, two, one])
+    one, two = Layout(4, 5, first=(7.0, 8.0)), Layout.of([Rectangle(2, 3), Rectangle(2, 2, corner=(2, 0))])
+    both = Layout.merged([one, two, one], [["a"], ["b"], ["c"]])
     assert both.places == 2 * one.places + two.places
-    assert int(both.distance(torch.tensor(19), torch.tensor(20))) > areas.GAP
-    assert both.between(20, 30) == two
-    assert both.between(30, 50) == one
+    assert int(both.distance(torch.tensor(19), torch.tensor(20))) >= areas.FAR
+    assert [both.only(route) for route in range(3)] == [one, two, one]
     assert torch.equal(both.coordinates(torch.arange(30, 50)), one.coordinates(torch.arange(20)))
 
 
@@ -94,7 +98,7 @@ def test_an_area_grows_by_windows_of_the_same_ground(picture, small_tiles, tmp_p
     grown = append(learn(picture(columns="0:128")), open_source(picture(columns="96:240")))
     area = grown.map.area
     assert area is not None
-    assert (area.rows, area.columns, area.places) == (*whole.area[:2], whole.area.places)
+    assert (area.rows, area.columns, area.places) == (whole.area.rows, whole.area.columns, whole.area.places)
     cells = area.cells(torch.arange(area.places))
     at = whole.area.place_at(cells)
     assert torch.equal(area.coordinates(torch.arange(area.places)), whole.coordinates.values[at])
@@ -120,33 +124,29 @@ def test_an_area_grows_by_windows_of_the_same_ground(picture, small_tiles, tmp_p
 def test_coordinates_of_metres_are_exact():
     """Northings of millions, and windows closer than the steps of float32 there."""
     steps = {"right": (0.16, 1e-5), "down": (1e-5, -0.16), "unit": "m", "frame": "EPSG:32632"}
-    area = Area(40, 50, first=(691_000.1, 5_334_000.3), **steps)
+    area = Layout(40, 50, first=(691_000.1, 5_334_000.3), **steps)
     places = torch.arange(area.places)
     assert torch.equal(area.place_near(area.coordinates(places)), places)
     for row, column in ((40, 3), (-7, 50), (0, -40)):
         first = torch.tensor(area.first, dtype=torch.float64)
         first += torch.tensor([[row, column]]).double()[0] @ torch.tensor([area.down, area.right]).double()
-        other = Area(7, 40, first=tuple(first.tolist()), **{**steps, "right": (0.16, 2e-5)})
-        grown = continued(area, other, "more")
-        assert grown is not None
-        own, added = grown.rectangles
+        other = Layout(7, 40, first=tuple(first.tolist()), **{**steps, "right": (0.16, 2e-5)})
+        own, added = area.grown(other, "more").rectangles
         assert (added.corner[0] - own.corner[0], added.corner[1] - own.corner[1]) == (row, column)
     for other, words in (
-        (area._replace(frame="EPSG:32633"), ("EPSG:32632 and EPSG:32633",)),
-        (area._replace(right=(0.32, 0.0)), ("0.16 and 0.32 m apart",)),
-        (area._replace(right=(0.0, 0.16), down=(0.16, 0.0)), ("north is 0",)),
+        (changed(area, frame="EPSG:32633"), ("EPSG:32632 and EPSG:32633",)),
+        (changed(area, right=(0.32, 0.0)), ("0.16 and 0.32 m apart",)),
+        (changed(area, right=(0.0, 0.16), down=(0.16, 0.0)), ("north is 0",)),
     ):
         with refused(*words):
-            continued(area, other, "more")
-    assert (
-        continued(area._replace(frame=""), other._replace(**steps, first=(691_000.1, 5_334_010.3)), "")
-        is not None
-    )
+            area.grown(other, "more")
+    beyond = changed(other, **{**steps, "first": (691_000.1, 5_334_010.3)})
+    assert changed(area, frame="").grown(beyond, "").frame == "EPSG:32632"
 
 
-@pytest.mark.parametrize("strip", [Area(3, 36), Area(36, 3)])
+@pytest.mark.parametrize("strip", [Layout(3, 36), Layout(36, 3)])
 def test_long_areas_follow_each_other(strip):
-    both = apart([strip] * 14)
+    both = Layout.merged([strip] * 14, [[str(route)] for route in range(14)])
     assert both.rows * both.columns < 2 * both.places == 2 * 14 * strip.places
 
 
@@ -173,7 +173,7 @@ def test_each_of_merged_areas_has_its_own_mean(small_tiles):
         2, 1, 1
     )
     models = [
-        DejaVu(mapper=SpectralMapper(step=0.01), whitening="none").learn_features(own, area=Area(6, 6))
+        DejaVu(mapper=SpectralMapper(step=0.01), whitening="none").learn_features(own, layout=Layout(6, 6))
         for own in rows
     ]
     merged = merge(models, ["low", "high"])
@@ -248,7 +248,7 @@ def test_what_does_not_fit_an_area_is_refused(picture, small_tiles, tmp_path, ca
     with refused("16 and 24 px apart", "does not continue the map"):
         append(model(), open_source(picture(columns="128:240", options="window=48&stride=24")))
     far = open_source(picture(columns="128:240"))
-    far.area = far.area._replace(first=(9e5, 24.0))
+    far.layout = changed(far.layout, first=(9e5, 24.0))
     with refused("13 x 5", "areas nearby", "merge"):
         append(model(), far)
     frames = torch.rand(20, 3, 48, 48)
@@ -259,10 +259,10 @@ def test_what_does_not_fit_an_area_is_refused(picture, small_tiles, tmp_path, ca
     with refused("b is the map of a route", "a of an area"):
         merge([model(), learn(frames)], ["a", "b"])
     metres, turned = model(), model()
-    metres.map.area = metres.map.area._replace(unit="m", frame="EPSG:32632")
+    metres.map.layout = changed(metres.map.layout, unit="m", frame="EPSG:32632")
     with refused("in pixels and EPSG:32632", "expected the same"):
         merge([model(), metres], ["a", "b"])
-    turned.map.area = turned.map.area._replace(right=(0.0, 16.0), down=(-16.0, 0.0))
+    turned.map.layout = changed(turned.map.layout, right=(0.0, 16.0), down=(-16.0, 0.0))
     with refused("north", "90 degrees"):
         merge([model(), turned], ["a", "b"])
     told = fails(

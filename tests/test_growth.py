@@ -25,14 +25,15 @@ from dejavu_torch import (
     open_source,
 )
 from dejavu_torch.data.arrays import ArrayTraverse
-from dejavu_torch.data.positions import count_places, positions_behind, shown_frames
 from dejavu_torch.features.views import LabelledFrames
 from dejavu_torch.features.whitening import Whitening
 from dejavu_torch.growth import append, associate, average, learn_mean, merge, only_route
 from dejavu_torch.maps.file import read_map
-from dejavu_torch.maps.frame_table import FrameTable, Route
 from dejavu_torch.maps.spectral import encode_chunk
 from dejavu_torch.maps.spectral_map import SpectralMap
+from dejavu_torch.places.frame_table import FrameTable
+from dejavu_torch.places.layout import Layout, Rectangle
+from dejavu_torch.places.positions import count_places, positions_behind, shown_frames
 from dejavu_torch.recognition.calibration import Calibration, Platt
 
 NUMBERS = 6
@@ -155,8 +156,9 @@ def test_no_place_is_lost_behind_more_than_float32_can_count():
     assert count_places(positions_behind(own, 2**24 - 50)) == 2**24
     with refused("16777217 places", "merge"):
         positions_behind(own, 2**24 - 49)
-    long = Route("one", 2**24 + 1, 50), Route("two", 50, 50)
-    table = FrameTable(sum(one.places for one in long), torch.cat([own, own]), long)
+    long = Rectangle(2**24 + 1, frames=50), Rectangle(50, route=1)
+    table = FrameTable(Layout.of(long, routes=["one", "two"]), torch.cat([own, own]))
+    assert table.routes == (("one", 2**24 + 1, 50), ("two", 50, 50))
     assert torch.equal(table.steps[50:] - 2**24, own.double() + 1)
 
 
@@ -194,7 +196,7 @@ def test_what_cannot_be_appended():
     for model, added, words in (
         (template_model().learn(walk(64)), walk(40), ("'templates'", "'spectral'")),
         (DejaVu(), walk(40), ("no map yet to append to",)),
-        (merge(routes("a", "b"), ["a", "b"]), walk(64), ("routes a, b", "append to the map of a route")),
+        (merge(routes("a", "b"), ["a", "b"]), walk(64), ("routes a, b", "by its name", "--route")),
         (features, torch.rand(40, 7), ("7 features", "expected 6")),
         (features, torch.rand(40, 1, 9, 9), ("has frames", "ready features")),
         (features, torch.full((40, NUMBERS), math.nan), ("NaN",)),
@@ -414,7 +416,7 @@ def test_a_state_that_does_not_fit_leaves_a_merged_map_as_it_was():
     extra = good["_extra_state"]
     for change, words in (
         ({"places": 231}, ("expected 231",)),
-        ({"routes": [extra["routes"][0], extra["routes"][1] | {"name": "a"}]}, ("names a, a",)),
+        ({"routes": [extra["routes"][0], extra["routes"][1] | {"name": "a"}]}, ("means (2, ", "(1, ")),
         ({"routes": extra["routes"][:1]}, ("means (2, ", "(1, ")),
     ):
         with refused(*words):

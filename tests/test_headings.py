@@ -13,7 +13,6 @@ from helpers import refused
 from PIL import Image
 
 from dejavu_torch import DejaVu, PlaceFilter, PlaceSmoother, SpectralMapper, Whitening, compare, open_source
-from dejavu_torch.area import Area
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.coordinates import read_coordinates
 from dejavu_torch.data.flight import Flight
@@ -21,6 +20,7 @@ from dejavu_torch.data.grid import Grid
 from dejavu_torch.data.traverse import Chain, Part
 from dejavu_torch.data.turning import Turned, facing_north, turned_north
 from dejavu_torch.maps.spectral_map import SpectralMap
+from dejavu_torch.places.layout import Layout
 from dejavu_torch.recognition.centring import learn_turned, set_apart
 from dejavu_torch.recognition.localizer import Localizer, Matching
 from dejavu_torch.recognition.select import best_candidates
@@ -76,7 +76,7 @@ def test_the_best_of_all_copies_is_the_minimum_of_their_scores(model, images):
     rows = model.descriptor(images)[:24]
     with torch.no_grad():
         scores = model.map.scores(rows).view(6, 4, -1)
-    expected = best_candidates(scores.amin(1), 4, 2, area=model.map.area)
+    expected = best_candidates(scores.amin(1), 4, 2, layout=model.map.layout)
     for search in ("auto", "scan"):
         matching = Matching(k=4, radius=2, copies=4, search=search)
         match = model.localize_descriptors(rows, matching)
@@ -99,11 +99,11 @@ def test_one_heading_is_none_bit_by_bit(model, ground):
 def test_known_headings_turn_as_by_hand(model, images, ground):
     query = ArrayTraverse(images)
     query.headings = (90 * QUARTERS).double()
-    north = facing_north(query, ground.area)
+    north = facing_north(query, ground.layout)
     assert isinstance(north, Turned)
     assert torch.allclose(north[:], ground[PLACES], atol=1e-5)
-    assert facing_north(north, ground.area) is north
-    assert facing_north(query, None) is query  # a car has headings too, and its images look ahead
+    assert facing_north(north, ground.layout) is north
+    assert facing_north(query, Layout(99)) is query  # a car has headings too, and its images look ahead
     match = model.localize(query)
     assert match.index.tolist() == PLACES.tolist()
     rows = model.descriptor(turned_north(images, 90 * QUARTERS))
@@ -111,7 +111,7 @@ def test_known_headings_turn_as_by_hand(model, images, ground):
     assert torch.equal(match.index, by_hand.index)
     assert torch.allclose(match.score, by_hand.score, atol=1e-5)
     query.headings[3] = math.nan
-    assert torch.allclose(facing_north(query, ground.area)[3], images[3], atol=1e-5)
+    assert torch.allclose(facing_north(query, ground.layout)[3], images[3], atol=1e-5)
 
 
 def as_pixels(images):
@@ -166,7 +166,7 @@ def test_what_is_set_apart_has_length_one():
 
 def hovering(ground, place=60, count=20):
     """Images of a camera over one place, which turns and moves a little, and their headings."""
-    middle = ground.area.coordinates(torch.tensor([place])) + torch.randn(count, 2).double()
+    middle = ground.layout.coordinates(torch.tensor([place])) + torch.randn(count, 2).double()
     headings = 120 + torch.arange(count).double()
     return Flight(ground.picture, middle.expand(count, 2), headings, ground.window)
 
@@ -198,7 +198,7 @@ def test_what_turned_images_have_in_common_is_in_the_file(tmp_path, model, groun
     assert not len(older.map.turned)
     rows = model.descriptor(turned_north(hover[:], hover.headings))
     assert torch.allclose(older.localize(hover).score, older.localize_descriptors(rows).score, atol=1e-5)
-    assert not len(DejaVu().learn_features(rows, area=Area(4, 5)).map.turned)
+    assert not len(DejaVu().learn_features(rows, layout=Layout(4, 5)).map.turned)
 
 
 def test_what_cannot_be_turned_is_refused(model, ground, images):
@@ -222,11 +222,13 @@ def test_what_cannot_be_turned_is_refused(model, ground, images):
 def test_commands_try_headings(tmp_path, model, ground, images, capsys):
     pixels = np.zeros((192, 224, 3), dtype=np.uint8)
     frames = as_pixels(ground[:])
-    for frame, (row, column) in zip(frames, (16 * ground.area.cells(torch.arange(99))).tolist(), strict=True):
+    for frame, (row, column) in zip(
+        frames, (16 * ground.layout.cells(torch.arange(99))).tolist(), strict=True
+    ):
         pixels[row : row + 64, column : column + 64] = frame
     Image.fromarray(pixels).save(tmp_path / "ground.png")
     write_images(tmp_path / "photos", as_pixels(images))
-    lines = (f"{x},{y}" for x, y in ground.area.coordinates(PLACES).tolist())
+    lines = (f"{x},{y}" for x, y in ground.layout.coordinates(PLACES).tolist())
     (tmp_path / "track.csv").write_text("\n".join(["x,y", *lines]))
     area, out = f"grid:{tmp_path}/ground.png?window=64&stride=16", tmp_path / "report"
     photos, known = f"{tmp_path}/photos?coordinates={tmp_path}/track.csv", tmp_path / "ground.safetensors"
@@ -243,15 +245,15 @@ def test_commands_try_headings(tmp_path, model, ground, images, capsys):
     assert "headings is 0; expected a whole number" in fails(capsys, "localize", *words)
 
 
-ROTATED = Area(
+ROTATED = Layout(
     9, 11, right=(0.5, 0.3), down=(0.3, -0.5), unit="m"
 )  # a picture that is turned by 30.96 degrees
 
 
 def test_headings_count_from_north_not_from_the_picture(model, images, ground):
-    assert Area(2, 2).north == 0
-    assert Area(2, 2, right=(0.5, 0.0), down=(0.0, -0.5), unit="m").north == 0
-    assert Area(2, 2, right=(0.0, 1.0), down=(-1.0, 0.0)).north == pytest.approx(-90)  # its right is south
+    assert Layout(2, 2).north == 0
+    assert Layout(2, 2, right=(0.5, 0.0), down=(0.0, -0.5), unit="m").north == 0
+    assert Layout(2, 2, right=(0.0, 1.0), down=(-1.0, 0.0)).north == pytest.approx(-90)  # its right is south
     # where rows rise to the right, north is to the right of up by as much
     north = math.degrees(math.atan2(0.3, 0.5))
     x, y = math.sin(math.radians(north)), -math.cos(math.radians(north))
@@ -260,7 +262,7 @@ def test_headings_count_from_north_not_from_the_picture(model, images, ground):
     assert ROTATED.north == pytest.approx(north)
     turned = DejaVu(mapper=SpectralMapper(8), whitening=model.whitening)
     turned.replace_map(model.map._sharing(), model.state)
-    turned.map.area = ROTATED
+    turned.map.layout = ROTATED
     match = turned.localize(images, headings=4)
     assert match.index.tolist() == PLACES.tolist()
     assert torch.allclose(match.heading, ((90 * QUARTERS - north) % 360).float())
@@ -280,7 +282,7 @@ def test_a_filter_tells_headings(model, ground):
 
 def test_frames_are_turned_as_they_come(tmp_path, model, ground, images, capsys):
     write_images(tmp_path / "photos", as_pixels(images))
-    rows = zip(ground.area.coordinates(PLACES).tolist(), (90 * QUARTERS).tolist(), strict=True)
+    rows = zip(ground.layout.coordinates(PLACES).tolist(), (90 * QUARTERS).tolist(), strict=True)
     (tmp_path / "track.csv").write_text("\n".join(["x,y,heading", *(f"{x},{y},{h}" for (x, y), h in rows)]))
     photos = f"{tmp_path}/photos?coordinates={tmp_path}/track.csv"
     model.save(tmp_path / "map.safetensors")

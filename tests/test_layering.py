@@ -12,34 +12,33 @@ FILES = sorted(file.relative_to(PACKAGE) for file in PACKAGE.rglob("*.py"))
 SOURCES = {file: (PACKAGE / file).read_text(encoding="utf-8") for file in FILES}
 # what each room uses, all of it above: a new arrow between two rooms is a decision, and is written down here
 ARROWS = {
-    "places": "",
-    "area": "places",
     "lazy": "",
     "text": "",
+    "places": "text",
     "version": "",
-    "types": "area text",
+    "types": "places text",
     "memory": "types",
     "resize": "types memory",
-    "data": "area lazy text types memory resize",
-    "features": "area text types memory resize data",
+    "data": "places lazy text types memory resize",
+    "features": "places text types memory resize data",
     "periods": "text types memory",
-    "maps": "places area lazy types text memory data periods",
-    "recognition": "places area text types memory maps",
-    "motion": "text types memory data",
-    "learning": "area text types memory data features maps recognition motion",
+    "maps": "places lazy types text memory data periods",
+    "recognition": "places text types memory maps",
+    "motion": "places text types memory data",
+    "learning": "places text types memory data features maps recognition motion",
     "model_file": "text version types memory data features periods maps recognition motion",
-    "model": "area text types resize data features maps recognition motion learning model_file",
+    "model": "places text types resize data features maps recognition motion learning model_file",
     "teaching": "types memory data features maps recognition model",
-    "growth": "area types data features maps motion recognition learning model_file model teaching",
-    "updating": "types data maps motion recognition model teaching growth",
+    "growth": "places types data features maps motion recognition learning model_file model teaching",
+    "updating": "places types data maps motion recognition model teaching growth",
     "cluster": "text types maps recognition",
     "live": "types memory data features recognition model",
-    "evaluation": "places area lazy text version types memory resize data features periods maps recognition "
+    "evaluation": "places lazy text version types memory resize data features periods maps recognition "
     "motion model_file model growth",
     "export": "text version types data features maps recognition model",
-    "training": "lazy text types memory resize data features periods maps recognition "
+    "training": "places lazy text types memory resize data features periods maps recognition "
     "motion model_file model growth evaluation",
-    "cli": "area text types data features periods maps recognition motion learning model_file model "
+    "cli": "text types data features periods maps recognition motion learning model_file model "
     "growth teaching updating cluster live export evaluation training",
 }
 

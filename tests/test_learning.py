@@ -26,6 +26,7 @@ from dejavu_torch.maps.spectral import SpectralMapper, encode_chunk
 from dejavu_torch.maps.spectral_map import SpectralMap
 from dejavu_torch.model import DejaVu
 from dejavu_torch.model_file import run_key
+from dejavu_torch.places.layout import Layout
 
 CHUNK, PLACES = 50, 1030
 
@@ -124,14 +125,14 @@ def test_bytes_do_not_hang_on_how_a_route_is_read(tmp_path):
 
 
 def test_convention_the_sample_is_evenly_spaced_and_of_whole_chunks():
-    found = Sample.of(PLACES, CHUNK)
+    found = Sample.of_route(Layout(PLACES), CHUNK)
     starts = found.frame[:: found.segment]
     assert (found.segment, len(found.frame)) == (CHUNK, 400)
     assert set((starts % CHUNK).tolist()) == {0}
     assert (starts[0], starts[-1]) == (0, PLACES // CHUNK * CHUNK - CHUNK)
     assert int(starts.diff().max() - starts.diff().min()) <= CHUNK
     # long chunks leave room for several stretches
-    found = Sample.of(PLACES, 500)
+    found = Sample.of_route(Layout(PLACES), 500)
     assert (found.segment, len(found.frame)) == (100, 400)
     assert int(found.frame.max()) < PLACES
 
@@ -144,10 +145,13 @@ def test_a_second_traverse_tells_of_what_is_in_the_sample():
     torch.manual_seed(0)
     noisy = route() + 0.2 * torch.randn(PLACES, 12)
     views = LabelledFrames(ArrayTraverse(noisy), torch.arange(PLACES))
-    assert len(Sample.of(PLACES, CHUNK).views(views).places) == 400
-    shown = Sample.of(PLACES, CHUNK).views(LabelledFrames(views.traverse, torch.arange(PLACES) - 30))
-    assert torch.equal(Sample.of(PLACES, CHUNK).frame[shown.places] + 30, shown.traverse.frame)  # type: ignore[attr-defined]
-    unseen = torch.tensor([one for one in range(PLACES) if one not in Sample.of(PLACES, CHUNK).frame][:40])
+    sample = Sample.of_route(Layout(PLACES), CHUNK)
+    assert len(sample.views(views).places) == 400
+    shown = Sample.of_route(Layout(PLACES), CHUNK).views(
+        LabelledFrames(views.traverse, torch.arange(PLACES) - 30)
+    )
+    assert torch.equal(sample.frame[shown.places] + 30, shown.traverse.frame)  # type: ignore[attr-defined]
+    unseen = torch.tensor([one for one in range(PLACES) if one not in sample.frame][:40])
     with refused("none of the 400 frames", "segments of 50"):
         learned(route(), second=LabelledFrames(ArrayTraverse(noisy[unseen]), unseen))
     model = DejaVu(whitening=Whitening(numbers=8), mapper=SpectralMapper(8.0, chunk=CHUNK))
@@ -291,7 +295,7 @@ def test_an_image_that_cannot_be_read_is_named_and_the_rest_kept(tmp_path, made)
         model = DejaVu(HOG(cell=8), "none", SpectralMapper(8.0, chunk=CHUNK))
         return file_of(model.learn(open_source(folder), checkpoint=Checkpoint(tmp_path / name)), tmp_path)
 
-    assert 434 not in Sample.of(520, CHUNK).frame
+    assert 434 not in Sample.of_route(Layout(520), CHUNK).frame
     whole = learn("undisturbed")
     (folder / "434.png").write_bytes(b"no image")
     with refused("434.png", "400 of 520", "m.part"):
@@ -312,7 +316,7 @@ def test_descriptors_of_a_long_route_in_one_chunk_lie_in_a_file(monkeypatch):
     assert found.shape == (PLACES, 33)
     assert model.whitening is not None
     other = DejaVu(whitening=Whitening(numbers=32))
-    other.descriptor.learn(ArrayTraverse(values[Sample.of(PLACES, learning.SAMPLE).frame]))
+    other.descriptor.learn(ArrayTraverse(values[Sample.of_route(Layout(PLACES), learning.SAMPLE).frame]))
     for name, value in other.whitening.state_dict().items():  # type: ignore[union-attr]
         assert torch.equal(value, model.whitening.state_dict()[name])
     assert torch.allclose(found.float(), model.whitening(values), rtol=1e-3, atol=1e-3)

@@ -108,7 +108,7 @@ def test_convention_11_candidates_are_even_steps_apart_and_written_as_frames(tmp
     assert torch.equal(candidates.index[:, 0], model.localize(query).index)
     assert (candidates.index[:, :, None] - candidates.index[:, None]).abs().add(99 * torch.eye(5)).min() > 6
     path = tmp_path / "m.csv"
-    write_matches(path, [candidates.map(torch.Tensor.flatten)], steps.frame, model.map.frame_of, ranks=5)
+    write_matches(path, [candidates.map(torch.Tensor.flatten)], steps.frame, model.map.table, ranks=5)
     read = read_matches(path)
     assert torch.equal(read.query, steps.frame)
     assert torch.equal(read.candidates, model.map.frame_of(candidates.index))

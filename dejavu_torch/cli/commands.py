@@ -82,7 +82,7 @@ def run_learn(
         opened = [open_source(one) for one in sources]
         for one in opened if len(opened) > 1 else ():
             expected = "one area alone, of which --append adds more to its map"
-            expect(one.area is None, expected, f"{one.name} is an area, one of {len(opened)} sources")
+            one.layout.expect_route(expected, f"{one.name} is an area, one of {len(opened)} sources")
         chain = chained(opened)
         traverse = model.resample(chain, model.step, True, model.frame_shape)
         print_steps(traverse)
@@ -348,17 +348,16 @@ def print_steps(traverse: Traverse) -> None:
 
 def print_map(model: DejaVu) -> None:
     """Print what a map holds, and the bytes that would hold enough if that is little."""
-    summary, start = model.summary(), 0
+    summary = model.summary()
     if summary.places and not summary.covered:
         print("this route does not repeat")
     print(summary)
     for route in model.map.routes:
         assert isinstance(model.map, SpectralMap)  # only these can be merged
-        size, stop = model.map.part(route.name).summary().route_bytes, start + route.places
+        size, layout = model.map.part(route.name).summary().route_bytes, model.map.layout
         frames = f" of {route.frames} frames" * (route.frames != route.places)
-        text = f"route {route.name}: places {start}-{stop - 1}{frames}, {size} bytes"
-        say(f"{text}, {size / route.places:.2f} per place")
-        start = stop
+        where = " and ".join(f"{run[0]}-{run[-1]}" for run in layout.ranges(layout.number(route.name)))
+        say(f"route {route.name}: places {where}{frames}, {size} bytes, {size / route.places:.2f} per place")
     if len(model.map.visits):
         counts = model.map.visit_counts.double()
         if counts.min() == 0:
@@ -414,5 +413,4 @@ def write_matches(
     if isinstance(query, ResampledTraverse):
         frames, source = query.frame, query.traverse
     names = source.names, model.frame_names
-    facts = model.map.frame_of, *names, ranks, model.map.routes, pairs, model.map.area
-    return files.write_matches(path, matches, frames, *facts)
+    return files.write_matches(path, matches, frames, model.map.table, *names, ranks, pairs)

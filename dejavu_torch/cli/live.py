@@ -13,7 +13,6 @@ from contextlib import ExitStack, suppress
 
 import numpy as np
 
-from dejavu_torch.area import same_windows
 from dejavu_torch.cli.process import interrupts_raise, output_problem
 from dejavu_torch.data.camera import Camera, Frame, is_stream, shots_of, stretched
 from dejavu_torch.data.source import open_source
@@ -34,10 +33,11 @@ log = logging.getLogger("dejavu_torch")
 
 def _pictures_of(model: DejaVu, reference: str) -> ReferencePictures:
     """The pictures of the map's reference, or an InputError."""
-    seen = f"--reference {reference}: the map has {len(model.map.routes)} routes"
-    expect(not model.map.routes, "the map of one route, or no --reference", seen)
+    layout = model.map.layout
+    seen = f"--reference {reference}: the map has {layout.count} routes"
+    layout.expect_one("the map of one route, or no --reference", seen)
     traverse = open_source(reference)
-    same = same_windows(model.map.area, traverse.area)
+    same = layout.same(traverse.layout)
     expect(same, "the area of the map", f"--reference {reference} is another one")
     return ReferencePictures(traverse, len(model.map.positions) or model.map.places)
 
@@ -144,7 +144,7 @@ def frames_from(
         if note := stretched(traverse.name, own, size):
             log.warning("%s", note)
         traverse = at_size(traverse, size)
-    traverse = facing_north(traverse, model.map.area)
+    traverse = facing_north(traverse, model.map.layout)
     frames = shots_of(traverse)
     if realtime or shown:
         frames = in_real_time(frames, traverse.name, None if realtime else RATE)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import threading
 from collections import Counter
 from collections.abc import Iterator
@@ -141,13 +140,12 @@ def run_localize(
 
 def _print_evaluate(out: Path, model: DejaVu, map: Path, source: str) -> None:
     """Print the command that scores the matches; in an area, of a source with coordinates."""
-    area, truth = model.map.area, "TRUTH"
-    needed: tuple[str | Path, ...] = ("--map", map) if model.step is not None or area is not None else ()
-    if area is not None:
-        truth = f"{'metres' if area.unit == 'm' else 'pixels'}:{2 * math.hypot(*area.right):g}"
-        needed += "--query", source
-    needed += ("--route", "ROUTE") if model.map.routes else ()
-    print_next("evaluate", out, "--truth", truth, *needed, "--out", "scores")
+    layout = model.map.layout
+    truth = layout.truth(2 * layout.spacing)
+    needed: tuple[str | Path, ...] = ("--map", map) if model.step is not None or truth else ()
+    needed += ("--query", source) if truth else ()
+    needed += ("--route", "ROUTE") if layout.count > 1 else ()
+    print_next("evaluate", out, "--truth", truth or "TRUTH", *needed, "--out", "scores")
 
 
 def _check_written(out: Path, pairs: Path | None, *read: str | Path) -> None:

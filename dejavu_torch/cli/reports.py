@@ -128,8 +128,7 @@ def run_compare(
     acceptance.check(matcher, judging.distractors)
     if map is not None:
         model = options.load_map(map, options.named_features(model))
-        names = ", ".join(route.name for route in model.map.routes)
-        expect(not model.map.routes, f"a map of {reference} alone", f"--map {map} has the routes {names}")
+        model.map.layout.expect_one(f"a map of {reference} alone", f"--map {map} has the routes {{}}")
         acceptance.of(model)
     searching.of(model.to(where))
     first = open_source(reference)

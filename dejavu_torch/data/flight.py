@@ -9,10 +9,10 @@ import torch
 from torch import Tensor
 from torch.nn.functional import grid_sample, normalize
 
-from dejavu_torch.area import Ground
 from dejavu_torch.data.files import as_number, read_rows
 from dejavu_torch.data.grid import BYTES, PIXELS
 from dejavu_torch.data.picture import Pixels, read_picture
+from dejavu_torch.places.layout import Ground
 from dejavu_torch.text import printable
 from dejavu_torch.types import Coordinates, InputError, Traverse, expect
 

@@ -13,9 +13,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dejavu_torch.area import Ground
 from dejavu_torch.data.files import reading
 from dejavu_torch.data.folder import as_bytes
+from dejavu_torch.places.layout import Ground
 from dejavu_torch.text import one_line
 from dejavu_torch.types import Facts, InputError, expect
 

@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from dejavu_torch.area import Area, Ground
 from dejavu_torch.data.picture import Pixels, read_picture
+from dejavu_torch.places.layout import Ground, Layout
 from dejavu_torch.text import printable
 from dejavu_torch.types import Coordinates, Traverse, expect
 
@@ -18,7 +18,7 @@ PIXELS = Ground()
 
 
 class Grid(Traverse):
-    """Square windows of a picture, in the order of the places of an `Area`.
+    """Square windows of a picture, in the order of the places of a `Layout`.
 
     Args:
         picture: (C,H,W) uint8. window: side of a window, pixels. stride: pixels from one to the next, in both
@@ -33,12 +33,11 @@ class Grid(Traverse):
 
     Example:
         >>> grid = Grid(torch.zeros(3, 80, 100, dtype=torch.uint8), window=64, stride=8)
-        >>> len(grid), grid.frame_shape, grid.area.rows, grid.area.columns
+        >>> len(grid), grid.frame_shape, grid.layout.rows, grid.layout.columns
         (15, (3, 64, 64), 3, 5)
     """
 
     sized = True
-    area: Area
 
     def __init__(
         self,
@@ -60,12 +59,12 @@ class Grid(Traverse):
         x, y = ground.at(middle).tolist()
         steps = ground.scaled(stride, stride)
         down, across = ((side - window) // stride + 1 for side in (height, width))
-        self.area = Area(down, across, (x, y), steps.right, steps.down, ground.unit, ground.frame)
-        every = self.area.coordinates(torch.arange(self.area.places))
+        self.layout = Layout(down, across, (x, y), steps.right, steps.down, ground.unit, ground.frame)
+        every = self.layout.coordinates(torch.arange(self.layout.places))
         self.coordinates = Coordinates(every, frame=ground.frame)
 
     def __len__(self) -> int:
-        return self.area.places
+        return self._layout.places
 
     def around(self, first: tuple[int, int], shape: tuple[int, int], margin: int) -> Tensor:
         """The pixels of some rows and columns of windows from the first one on, and a margin around them,
@@ -80,7 +79,7 @@ class Grid(Traverse):
         return pad(pixels[None], beyond, mode="replicate")
 
     def read(self, frames: range | list[int]) -> Tensor:
-        corners = (self.area.cells(torch.as_tensor(frames)) * self.stride).tolist()
+        corners = (self.layout.cells(torch.as_tensor(frames)) * self.stride).tolist()
         side = self.window
         return torch.stack([self.picture[:, y : y + side, x : x + side] for y, x in corners]).float() / BYTES
 

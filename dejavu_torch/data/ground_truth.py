@@ -19,12 +19,12 @@ import torch
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
-from dejavu_torch.area import Area
 from dejavu_torch.data.coordinates import FORMS as COORDINATES
 from dejavu_torch.data.coordinates import OF_MAPS, Near, coordinates_of
 from dejavu_torch.data.files import LARGEST, as_number, check_regular
 from dejavu_torch.data.truth_files import places_of_queries, read_csv, read_json, read_matrices
 from dejavu_torch.memory import check_room
+from dejavu_torch.places.layout import Layout
 from dejavu_torch.text import one_line, rounded
 from dejavu_torch.types import InputError, Traverse, expect
 
@@ -189,16 +189,15 @@ def near_truth(reference: Tensor, query: Tensor, radius: float) -> Tensor:
     return padded(rows)
 
 
-def check_unit(near: Near, area: Area) -> None:
+def check_unit(near: Near, layout: Layout) -> None:
     """Refuse a distance in pixels for an area in metres, and the reverse."""
-    seen = f"truth {near.kind}:{near.radius:g}, and coordinates of the area in {area.frame or area.unit}"
-    expect(near.unit == area.unit, "the same unit", seen)
+    layout.expect_unit(near.unit, f"truth {near.kind}:{near.radius:g}")
 
 
-def widened(truth: GroundTruth, area: Area, radius: int) -> GroundTruth:
-    """A ground truth of which all windows up to a radius from a right one are right."""
+def widened(truth: GroundTruth, layout: Layout, radius: int) -> GroundTruth:
+    """A ground truth of which all places up to a radius from a right one are right."""
     known = truth.positives.clamp(min=0).flatten()
-    near = area.around(known, radius).view(*truth.positives.shape, -1)
+    near = layout.around(known, radius).view(*truth.positives.shape, -1)
     return truth._replace(positives=near.masked_fill((truth.positives < 0)[..., None], -1).flatten(1))
 
 

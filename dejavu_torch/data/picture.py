@@ -16,11 +16,11 @@ import torch
 from PIL import Image, ImageOps
 from torch import Tensor
 
-from dejavu_torch.area import Ground
 from dejavu_torch.data.files import as_number, reading
 from dejavu_torch.data.folder import as_bytes, formats
 from dejavu_torch.data.geotiff import GeoTiff, has_rasterio
 from dejavu_torch.memory import check_room, without_autocast
+from dejavu_torch.places.layout import Ground
 from dejavu_torch.text import printable
 from dejavu_torch.types import Facts, InputError
 

@@ -46,7 +46,7 @@ class Part(Traverse):
             values = traverse.coordinates.values[torch.as_tensor(frame)]
             self.coordinates = traverse.coordinates._replace(values=values)
         if isinstance(frame, range) and frame == range(len(traverse)):
-            self.area = traverse.area
+            self.layout = traverse.layout
         if traverse.cut is not None and isinstance(frame, range):
             image, cuts = traverse.cut
             self.cut = image, cuts[frame.start : frame.stop : frame.step]
@@ -89,7 +89,7 @@ def frame_range(traverse: Traverse, start: int = 0, stop: int = 0, step: int = 1
         tensor([1., 3., 5.])
     """
     asked = f"{traverse.name}: start={start}, stop={stop}, step={step}"
-    expect(traverse.area is None, f"{PARTS} or stride=..., as it is an area", asked)
+    traverse.layout.expect_route(f"{PARTS} or stride=..., as it is an area", asked)
     length = len(traverse)
     if start < 0 or step < 1 or not (stop == 0 or start < stop) or max(start + 1, stop) > length:
         expected = "a step of at least 1" if step < 1 else f"a part of its {length} frames"
@@ -181,7 +181,8 @@ class Cropped(Part):
         fits = len(shape) == 3 and min(crop) >= 0 and top + bottom < shape[1] and left + right < shape[2]
         seen = f"{traverse.name}: crop={','.join(map(str, crop))} of {' x '.join(map(str, shape))}"
         expect(fits, "frames, of which some pixels are left", seen)
-        expect(traverse.area is None or not any(crop), f"{PARTS} and window=..., as it is an area", seen)
+        if any(crop):
+            traverse.layout.expect_route(f"{PARTS} and window=..., as it is an area", seen)
         self.box = slice(top, shape[1] - bottom), slice(left, shape[2] - right)
         size = shape[1], shape[2]
         self.mask = None if mask is None else (resize_frames(mask[None], size) >= 0.5).float()

@@ -6,9 +6,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from dejavu_torch.area import Area
 from dejavu_torch.data.traverse import Part
 from dejavu_torch.memory import without_autocast
+from dejavu_torch.places.layout import Layout
 from dejavu_torch.types import Traverse, expect
 
 MOST = 360  # headings of an image that are tried
@@ -43,7 +43,7 @@ class Turned(Part):
         return turned_north(super().read(frames), self.heading[torch.as_tensor(frames)])
 
 
-def facing_north(traverse: Traverse, area: Area | None, headings: int = 1) -> Traverse:
+def facing_north(traverse: Traverse, layout: Layout, headings: int = 1) -> Traverse:
     """Queries as the map of an area compares them: turned by their own headings, if these are known, or, for
     more than one of `headings`, as many copies of each frame, turned evenly over 360 degrees. On a route, and
     without known headings, they stay as they are.
@@ -54,11 +54,11 @@ def facing_north(traverse: Traverse, area: Area | None, headings: int = 1) -> Tr
     fits = isinstance(headings, int) and 1 <= headings <= MOST
     expect(fits, f"a whole number from 1 to {MOST}", headings=headings)
     if headings > 1:
-        expect(area is not None, "the map of an area, as of grid:PICTURE", f"headings {headings} on a route")
+        layout.expect_area("the map of an area, as of grid:PICTURE", f"headings {headings} on a route")
         seen = f"headings {headings}, and {traverse.name} has ready features"
         expect(len(traverse.frame_shape) == 3, "images, which can be turned", seen)
         evenly = (torch.arange(headings) * 360 / headings).repeat(len(traverse))
         return Turned(traverse, evenly, headings)
-    if area is None or traverse.headings is None or len(traverse.frame_shape) != 3:
+    if traverse.headings is None or len(traverse.frame_shape) != 3 or not layout.has_north:
         return traverse
-    return Turned(traverse, traverse.headings + area.north)
+    return Turned(traverse, traverse.headings + layout.north)

@@ -17,10 +17,9 @@ LOWEST, HIGHEST = 0.3, 1.5  # height of a picture, relative to its width; axes o
 
 def draw_area(run: Localization) -> plots.Pictures:
     """The places reported for the queries, on the ground; lines lead to wrong ones from where they are."""
-    area, match = run.model.map.area, run.scored
-    assert area is not None
+    layout, match = run.model.map.layout, run.scored
     found = match.index >= 0
-    at = area.coordinates(match.index.clamp(min=0))
+    at = layout.coordinates(match.index.clamp(min=0))
     known = source_of(run.query).coordinates
     own = None if known is None else known.values[run.query_frames, :2]
     figure, axis = _ground(run)
@@ -48,29 +47,28 @@ def draw_area(run: Localization) -> plots.Pictures:
     if run.answers == "drive":
         single = run.by_one
         missed = faults(single, run.truth, run.tolerance)[1]
-        plots.show_wrong(axis, *area.coordinates(single.index[missed]).T)
+        plots.show_wrong(axis, *layout.coordinates(single.index[missed]).T)
     plots.legend(figure, ncols=2, markerscale=2)
     return plots.picture("coverage", (figure, axis), truth=run.truth, area=True, lines=own is not None)
 
 
 def draw_heat(run: Localization) -> plots.Pictures:
     """The scores of one query in the middle at all places."""
-    area, query = run.model.map.area, len(run.query_frames) // 2
-    assert area is not None
+    layout, query = run.model.map.layout, len(run.query_frames) // 2
     scores = run.scores(torch.tensor([query]))[0]
     if not scores.isfinite().any():
         return {}
-    cells = area.cells(torch.arange(area.places))
-    plane = scores.new_full((area.rows, area.columns), torch.nan)
+    cells = layout.cells(torch.arange(layout.places))
+    plane = scores.new_full((layout.rows, layout.columns), torch.nan)
     plane[cells[:, 0], cells[:, 1]] = scores.masked_fill(scores.isinf(), torch.nan)
     figure, axis = _ground(run)
-    placed = Affine2D.from_values(*area.right, *area.down, *area.first) + axis.transData
+    placed = Affine2D.from_values(*layout.right, *layout.down, *layout.first) + axis.transData
     image = axis.imshow(plane.numpy(), cmap="gray", aspect=axis.get_aspect(), transform=placed)
     plots.colour_bar(figure, image, axis, "score", shrink=0.8)
     index = int(run.scored.index[query])
     style: Facts = {"markerfacecolor": "none", "markersize": 9, "linestyle": "none"}
     if index >= 0:
-        place = area.coordinates(torch.tensor(index))
+        place = layout.coordinates(torch.tensor(index))
         axis.plot(*place, "o", color=COLOURS["map"], label="reported place", **style)
     known = source_of(run.query).coordinates
     if known is not None:
@@ -81,18 +79,16 @@ def draw_heat(run: Localization) -> plots.Pictures:
 
 def _ground(run: Localization) -> plots.Plot:
     """Axes with the sides of the area."""
-    area = run.model.map.area
-    assert area is not None
-    ends = torch.tensor([[row, column] for row in (0, area.rows - 1) for column in (0, area.columns - 1)])
-    corners = area.coordinates(area.place_at(ends))
+    layout = run.model.map.layout
+    ends = torch.tensor([[row, column] for row in (0, layout.rows - 1) for column in (0, layout.columns - 1)])
+    corners = layout.coordinates(layout.place_at(ends))
     (left, top), (right, bottom) = corners.amin(0).tolist(), corners.amax(0).tolist()
-    if torch.tensor([area.right, area.down]).det() < 0:  # y grows upwards, as to the north
+    if torch.tensor([layout.right, layout.down]).det() < 0:  # y grows upwards, as to the north
         top, bottom = bottom, top
     wide, tall = (max(1e-6, abs(side)) for side in (right - left, bottom - top))
     shape = min(HIGHEST, max(LOWEST, tall / wide))
     figure, axis = plots.canvas(plots.WIDTH * shape + 6 * plots.LINE)
-    unit = "metres" if area.unit == "m" else "pixels"
     axis.set(xlim=(left, right), ylim=(bottom, top), aspect="equal" if shape == tall / wide else "auto")
-    axis.set(xlabel=f"x ({unit})", ylabel=f"y ({unit})")
+    axis.set(xlabel=f"x ({layout.units})", ylabel=f"y ({layout.units})")
     axis.locator_params(axis="x", nbins=4 if corners.amax() >= LONG else "auto")  # numbers of six digits
     return figure, axis

@@ -13,7 +13,6 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from dejavu_torch.area import Area
 from dejavu_torch.evaluation.controls import leave_out_match, null_map, with_mapper
 from dejavu_torch.evaluation.quantiser import CENTROIDS, product_quantised
 from dejavu_torch.features.descriptor import is_ready
@@ -27,7 +26,7 @@ from dejavu_torch.maps.template_map import TemplateMap, TemplateMapper
 from dejavu_torch.model import DejaVu
 from dejavu_torch.model_file import recipe_of
 from dejavu_torch.motion.resampling import ResampledTraverse
-from dejavu_torch.places.layout import Layout
+from dejavu_torch.places.layout import ROUTE, Layout
 from dejavu_torch.recognition.drive import DriveQuery, localize_drives
 from dejavu_torch.recognition.localizer import SINGLE, Localizer, Matching, Scoring, drive_query, whole
 from dejavu_torch.recognition.smoother import PlaceSmoother
@@ -42,6 +41,7 @@ log = logging.getLogger("dejavu_torch")
 BLOCK_DISTANCES = 2**22  # of Q x N, computed at a time
 ASKED = 1000  # frames, at most, that a stride is chosen by
 SAME_SIZE = 1.02  # times the bytes that a quantiser may take
+INTERPOLATES = {1: True, 2: False}  # between frames, by the dimensions of a layout
 
 
 class Baseline(NamedTuple):
@@ -67,7 +67,7 @@ def nearest_frames(
     metric: Metric = "l1",
     progress: bool = False,
     matching: Matching = SINGLE,
-    area: Area | None = None,
+    layout: Layout = ROUTE,
 ) -> Match:
     """The nearest stored frame of each query, if every k-th reference frame is stored.
 
@@ -75,16 +75,16 @@ def nearest_frames(
         reference: (N,D) features. query: (Q,D) features.
         k: 1 stores all frames. Other frames have the distance of the nearest stored one.
         progress: show progress on stderr.
-        area: of the frames, if they are of one: every k-th is stored in rows and in columns.
+        layout: of the frames: every k-th is stored in each direction.
 
     Returns:
         Match of (Q,). Single queries find stored frames only, sequences also frames between these.
     """
     parts = query.split(whole(BLOCK_DISTANCES // len(reference), matching.copies))
-    matcher, stored = Localizer(None, matching, area=area), stored_frames(len(reference), k, area)[0]
+    matcher, stored = Localizer(None, matching, layout=layout), stored_frames(len(reference), k, layout)[0]
     single = matching.sequence is None or matcher.own == 1
-    alone = Localizer(None, matching._replace(sequence=None, also={}), area=area)
-    score, found = scores_of_stored(reference, k, metric, area), []
+    alone = Localizer(None, matching._replace(sequence=None, also={}), layout=layout)
+    score, found = scores_of_stored(reference, k, metric, layout), []
     for scores in map(score, with_progress(parts, "baselines", progress)):
         match = matcher.match(scores)
         if k > 1 and (single or 1 in match.sequences):  # else another place would be the same stored frame
@@ -101,11 +101,9 @@ def of_stored(scores: Tensor, stored: Tensor) -> Tensor:
     return scores.masked_fill(between.to(scores.device), math.inf)
 
 
-def scores_of_stored(
-    reference: Tensor, k: int = 1, metric: Metric = "l1", area: Area | None = None
-) -> Scoring:
+def scores_of_stored(reference: Tensor, k: int = 1, metric: Metric = "l1", layout: Layout = ROUTE) -> Scoring:
     """The distances of queries from the nearest stored frame of each place, see `nearest_frames`."""
-    frames, nearest = stored_frames(len(reference), k, area)
+    frames, nearest = stored_frames(len(reference), k, layout)
     stored = reference if k == 1 else reference[frames.to(reference.device)]
 
     def score(queries: Tensor) -> Tensor:
@@ -115,14 +113,14 @@ def scores_of_stored(
     return score
 
 
-def stored_frames(frames: int, k: int, area: Area | None = None) -> tuple[Tensor, Tensor]:
+def stored_frames(frames: int, k: int, layout: Layout = ROUTE) -> tuple[Tensor, Tensor]:
     """The frames that a stride of k stores, (n,), and of each frame which of these is nearest, (N,)."""
-    return (area or Layout(frames)).strided(k)
+    return layout.reaching(frames).strided(k)
 
 
-def stride_bytes(frames: int, dimension: int, itemsize: int, k: int, area: Area | None = None) -> int:
+def stride_bytes(frames: int, dimension: int, itemsize: int, k: int, layout: Layout = ROUTE) -> int:
     """Bytes of every k-th of `frames` frames."""
-    return len(stored_frames(frames, k, area)[0]) * dimension * itemsize
+    return len(stored_frames(frames, k, layout)[0]) * dimension * itemsize
 
 
 def fair_stride(frames: int, dimension: int, itemsize: int, map_bytes: int, tolerance: int) -> int:
@@ -156,7 +154,7 @@ def quantised_every_kth(
     descriptors: Tensor,
     each: float,
     tolerance: int,
-    area: Area | None = None,
+    layout: Layout = ROUTE,
     seed: int = 0,
     centroids: int = CENTROIDS,
     training: Tensor | None = None,
@@ -166,12 +164,12 @@ def quantised_every_kth(
 
     Args:
         descriptors: (N,K). each: bytes per frame, of the codes. tolerance: in frames.
-        area: of the frames, if they are of one: every k-th is stored in rows and in columns.
+        layout: of the frames: every k-th is stored in each direction.
         seed, centroids, training: see `product_quantised`.
     """
     frames, width = descriptors.shape
     middle = torch.arange(frames)[1:-1]
-    layout = area or Layout(frames)
+    layout = layout.reaching(frames)
     middle = middle[layout.distance(middle - 1, middle + 1) == 2]
     middle = middle[torch.linspace(0, len(middle) - 1, min(ASKED, len(middle))).round().long()]
     asked, bits = (descriptors[middle - 1] + descriptors[middle + 1]) / 2, math.log2(centroids)
@@ -206,9 +204,9 @@ def baselines_of(
         progress: show progress bars on a terminal.
     """
     model, reference, matching = run.model, run.reference_features, run.matching
-    area = model.map.area
+    layout = model.map.layout
     spectral = isinstance(model.map, SpectralMap)
-    one = "place" if len(model.map.positions) else "frame" if area is None else "window"
+    one = "place" if len(model.map.positions) else layout.noun
     summary, coarsest, (frames, dimension) = model.summary(), run.coarsest, reference.shape
     needed = ("backbone", "whitening") if spectral else ("backbone",)  # by every baseline
     fixed = sum(summary.fixed.get(part, 0) for part in needed)
@@ -218,12 +216,12 @@ def baselines_of(
 
     def nearest(name: str, stored: Tensor, k: int, bytes: int, stride: int = 1, more: int = 0) -> Baseline:
         match = run.match_by(
-            lambda *how: nearest_frames(stored, how[0], stride, metric, progress, how[1], area)
+            lambda *how: nearest_frames(stored, how[0], stride, metric, progress, how[1], layout)
         )
-        asked = run.drive_query(scores_of_stored(stored, stride, metric, area))
+        asked = run.drive_query(scores_of_stored(stored, stride, metric, layout))
         return Baseline(name, match, bytes + fixed + more, k, fixed + more, asked)
 
-    size, own = partial(stride_bytes, frames, dimension, area=area), reference.element_size()
+    size, own = partial(stride_bytes, frames, dimension, layout=layout), reference.element_size()
     if spectral:
         short, name, strided = as_int8(reference), "its descriptors", f"{every(coarsest, one)}, int8"
         found = _in_one_byte(run, one, progress) if summary.route_bytes >= 1.5 * frames else {}
@@ -231,12 +229,12 @@ def baselines_of(
         if is_ready(run.reference):
             found = _as_given(run, summary.route_bytes / frames, seed, one, progress) | found
         else:
-            coded = quantised_every_kth(reference, summary.route_bytes / frames, coarsest // 2, area, seed)
+            coded = quantised_every_kth(reference, summary.route_bytes / frames, coarsest // 2, layout, seed)
             restored, k, taken, books, _ = coded
             quantiser = f"{name}, {every(k, one)}, product quantiser"
             found["product_quantiser"] = nearest(quantiser, restored, k, taken, k, books)
         found["stride"] = nearest(f"{name}, {strided}", short, coarsest, size(1, coarsest), coarsest)
-        if area is None:  # along a route
+        if INTERPOLATES[layout.dimensions]:
             between, spaced, keys = interpolated(short, summary.route_bytes)
             interpolating = f"{name}, {every(spaced, one)}, interpolated"
             found["interpolated"] = nearest(interpolating, between, spaced, keys * dimension)
@@ -275,7 +273,7 @@ def _in_one_byte(run: Localization, one: str, progress: bool) -> dict[str, Basel
     same = place_map.chunk, place_map.transform, place_map.metric, place_map.resolution
     small = with_mapper(model, SpectralMapper(1.0, None, *same))
     try:
-        small.learn_features(run.reference_features, area=place_map.area)
+        small.learn_features(run.reference_features, layout=place_map.layout)
     except InputError:  # less than the mean takes
         return {}
     match = run.match_by(lambda query, how: small.localize_descriptors(query, how, progress=progress))
@@ -296,7 +294,7 @@ def _as_given(run: Localization, each: float, seed: int, one: str, progress: boo
         asked = None
         if run.beside is not None:
             score = scores_of_stored(rows, k, "cosine")
-            asked = drive_query(queries, run.beside, score, area=run.model.map.area)
+            asked = drive_query(queries, run.beside, score, layout=run.model.map.layout)
         return Baseline(f"your descriptors, {every(k, one)}{name}", match, bytes + fixed, k, fixed, asked)
 
     return {
@@ -401,8 +399,7 @@ def hog_baselines(
 
     known: HOG of both traverses, if it has been computed before.
     """
-    resampled = isinstance(reference, ResampledTraverse)
-    one = "place" if resampled else "frame" if reference.area is None else "window"
+    one = "place" if isinstance(reference, ResampledTraverse) else reference.layout.noun
     strides = {"hog": 1, "hog_stride_coarsest": max(1, 2 * tolerance)}
     names = {key: (f"HOG, {every(k, one)}", k) for key, k in strides.items()}
     plain = DejaVu(whitening="none", batch_size=batch_size)
@@ -429,13 +426,13 @@ def _described_baselines(
     except InputError as error:
         log.info("no %s to compare with: %s", type(plain.features).__name__, error)
         return {}
-    area = traverses[0].area
-    size = partial(stride_bytes, len(stored), stored.shape[1], stored.element_size(), area=area)
+    layout = traverses[0].layout
+    size = partial(stride_bytes, len(stored), stored.shape[1], stored.element_size(), layout=layout)
 
     def baseline(name: str, k: int) -> Baseline:
-        match = nearest_frames(stored, queries, k, "l1", progress, matching, area)
-        score = scores_of_stored(stored, k, area=area)
-        asked = None if smoother is None else drive_query(queries, smoother, score, area=area)
+        match = nearest_frames(stored, queries, k, "l1", progress, matching, layout)
+        score = scores_of_stored(stored, k, layout=layout)
+        asked = None if smoother is None else drive_query(queries, smoother, score, layout=layout)
         return Baseline(name, match, size(k), k, asked=asked)
 
     return {key: baseline(name, k) for key, (name, k) in names.items()}

@@ -15,7 +15,6 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from dejavu_torch.area import Area, same_windows
 from dejavu_torch.data.arrays import UNNAMED
 from dejavu_torch.data.coordinates import Near
 from dejavu_torch.data.ground_truth import (
@@ -47,6 +46,7 @@ from dejavu_torch.maps.spectral_map import SpectralMap
 from dejavu_torch.maps.template_map import TemplateMapper
 from dejavu_torch.model import DejaVu, check_apart, check_loops_along, check_queries, features_per_frame
 from dejavu_torch.motion.resampling import ground_truth_of, resampled, source_of
+from dejavu_torch.places.layout import Layout, Reach
 from dejavu_torch.recognition.calibration import TOLERANCE
 from dejavu_torch.recognition.centring import centred, set_apart
 from dejavu_torch.recognition.filter import PlaceFilter
@@ -59,8 +59,9 @@ log = logging.getLogger("dejavu_torch")
 
 SAMPLED = 256  # reference frames that a given map is checked with
 NEAR = 10  # places within which the map should find them, at least
-# scores up to which ordered queries are also filtered and smoothed by default, on a route and over an area
-MAX_FILTERED, MAX_FLOWN = 2**25, 2**23
+# by the dimensions of a layout: scores up to which ordered queries are also filtered and smoothed by default,
+# and whether sequences, which follow the numbers of places, are compared
+MOST, FOLLOWS = {1: 2**25, 2: 2**23}, {1: True, 2: False}
 DRIVEN = ("uncompressed", "null")  # contenders that are also matched as a whole drive
 
 Seconds = dict[str, float]  # that each stage took
@@ -158,16 +159,17 @@ def compare(
         alone = query is None and leave_out is None and not (distractors or storage_curve or top != 1)
         _check_loops(loops, alone, sequence)
         reference, centre = as_traverse(reference), False  # the mean is that of the map
-        check_loops_along(reference.area)
+        check_loops_along(reference.layout)
     elif query is None:
         raise InputError("there is no query; expected a second visit, or loops within the reference")
     query = reference if query is None else query
     _check_storage(model, storage_curve, headings)
     reference, query, off = _prepared(model, reference, query, distractors, seconds, progress, loops)
     check_candidates(top, tolerance, len(reference))
-    north = facing_north(query, reference.area, headings)  # pictures show images, not their copies
+    layout = reference.layout
+    north = facing_north(query, layout, headings)  # pictures show images, not their copies
     query = north if headings == 1 else query
-    truth, near, tolerance, within, radius = _reach(truth, query, reference.area, tolerance)
+    truth, near, (tolerance, within, radius) = _reach(truth, query, layout, tolerance)
     in_order = source_of(query).ordered if ordered is None else ordered
     smoother, causal = _ways(sequence, in_order and len(query) > 1)
     if causal is not None:
@@ -175,8 +177,8 @@ def compare(
     # without a given truth, each place would be its own answer
     known = None if itself and truth is None else ground_truth_of(truth, reference, query, interpolate)
     expect(known is not None or not storage_curve, "a truth", "there is none to judge a storage curve by")
-    if reference.area is not None and known is not None and near is None:
-        known = widened(known, reference.area, within)
+    if known is not None and near is None and within > tolerance:
+        known = widened(known, layout, within)
 
     rivals = () if known is None else (reference, query)  # of HOG, for its baseline
     with model.descriptor.setting_aside(*rivals):
@@ -197,7 +199,7 @@ def compare(
                 # without truth they have no scores
                 beside = in_order and known is not None and not itself and headings == 1
                 sizes = (len(query), model.map.places, reach)
-                also, alike = _beside(causal, beside, ordered is not None, *sizes, reference.area)
+                also, alike = _beside(causal, beside, ordered is not None, *sizes, layout)
                 centring = in_order and model.centres(len(query)) if centre is None else centre
                 matching = Matching(causal, also, apart=loops, copies=headings)
                 run = _described(model, reference, query, places, centring, tolerance, matching, progress)
@@ -234,20 +236,17 @@ def compare(
 
 
 def _reach(
-    truth: Truth | None, query: Traverse, area: Area | None, tolerance: int
-) -> tuple[Truth | None, Near | None, int, int, float]:
-    """The truth, in an area by coordinates if none is given; the same if it is by distance; the tolerance of
-    places; within how many of them, and which distance, an answer is right."""
-    if area is not None and truth is None and query.coordinates is not None:
-        truth = f"{'metres' if area.unit == 'm' else 'pixels'}:{tolerance}"
+    truth: Truth | None, query: Traverse, layout: Layout, tolerance: int
+) -> tuple[Truth | None, Near | None, Reach]:
+    """The truth, over an area by coordinates if none is given; the same if it is by distance; and within
+    which answers are right."""
+    if truth is None and query.coordinates is not None:
+        truth = layout.truth(tolerance)
     parsed = None if truth is None else check_ground_truth(truth)
     near = parsed if isinstance(parsed, Near) else None
-    if area is None:
-        return truth, near, tolerance, tolerance, float(tolerance)
     if near is not None:
-        check_unit(near, area)
-    radius = float(tolerance) if near is None else near.radius
-    return truth, near, 0, round(radius / math.hypot(*area.right)), radius  # all windows within it are right
+        check_unit(near, layout)
+    return truth, near, layout.reach(tolerance, None if near is None else near.radius)
 
 
 def _check_settings(
@@ -327,15 +326,14 @@ def _beside(
     queries: int,
     places: int,
     within: int,
-    area: Area | None,
+    layout: Layout,
 ) -> tuple[dict[Together, SequenceModel], PlaceSmoother | None]:
     """The sequence models and the smoother that are compared, if they are `wanted`: on few scores, or, if the
     user has `asked` for them, on any number."""
-    most = math.inf if asked else MAX_FILTERED if area is None else MAX_FLOWN
+    most = math.inf if asked else MOST[layout.dimensions]
     beside = wanted and queries * places <= most
     also = models_beside(causal, beside, queries, places, within)
-    if area is not None:  # sequences follow the numbers of places
-        also = {way: one for way, one in also.items() if way == "filter"}
+    also = {way: one for way, one in also.items() if way == "filter" or FOLLOWS[layout.dimensions]}
     return also, PlaceSmoother(within=within) if beside and queries > 1 else None
 
 
@@ -373,7 +371,7 @@ def _prepared(
     if has_map:
         check_places(model, len(reference), reference.name)
         expected = "that of the map; answers of a grown map are scored by `dejavu evaluate --map`"
-        own = same_windows(model.map.area, reference.area)
+        own = model.map.layout.same(reference.layout)
         expect(own, expected, f"{reference.name} is another area")
         check_queries(model, reference.frame_shape, features, reference.name)
     return reference, query, [even(other, step=step) for other in off]
@@ -517,7 +515,7 @@ def _match_distractors(
         return {}
     probabilities = {}
     for other in distractors:
-        asked = facing_north(other, model.map.area, headings)
+        asked = facing_north(other, model.map.layout, headings)
         queries = model.descriptor.all_of(asked, progress)
         matching = model.matching(copy.deepcopy(whole) if whole else sequence)._replace(copies=headings)
         if isinstance(asked, Turned):

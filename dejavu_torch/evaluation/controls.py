@@ -78,7 +78,7 @@ def null_map(
         log, level = logging.getLogger("dejavu_torch"), logging.getLogger("dejavu_torch").level
         log.setLevel(logging.ERROR)  # warnings about the null would confuse the user
         try:
-            null.learn_features(mixed, area=model.map.area)
+            null.learn_features(mixed, layout=model.map.layout)
         finally:
             log.setLevel(level)
     return null, order

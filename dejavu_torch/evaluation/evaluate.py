@@ -13,7 +13,6 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from dejavu_torch.area import Area, same_windows
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.coordinates import Near, coordinates_of
 from dejavu_torch.data.ground_truth import (
@@ -28,7 +27,6 @@ from dejavu_torch.data.ground_truth import (
     of_loops,
     offset_of,
 )
-from dejavu_torch.data.positions import unit_of
 from dejavu_torch.evaluation import curves
 from dejavu_torch.evaluation.answers import answer_facts, shift_facts
 from dejavu_torch.evaluation.contenders import contend
@@ -41,6 +39,8 @@ from dejavu_torch.evaluation.score_plots import draw_curves
 from dejavu_torch.maps.place_map import PlaceMap
 from dejavu_torch.maps.spectral_map import SpectralMap
 from dejavu_torch.model_file import read_place_map
+from dejavu_torch.places.layout import ROUTE, Layout
+from dejavu_torch.places.positions import unit_of
 from dejavu_torch.recognition.calibration import TOLERANCE
 from dejavu_torch.text import plain_number, printable
 from dejavu_torch.types import Coordinates, Facts, InputError, Match, Traverse, expect
@@ -100,18 +100,20 @@ def evaluate_file(
         raise InputError(f"the tolerance is {tolerance}; expected at least 0")
     parsed = None if truth is None else check_ground_truth(truth, interpolate)
     place_map = None if map is None else _map_of(map, route)
-    area = reference.area if reference is not None else None if place_map is None else place_map.area
-    near = parsed if area is not None and isinstance(parsed, Near) else None
-    if area is not None and near is not None:
-        check_unit(near, area)
-    if area is not None and tolerance:  # numbers of places tell no distance there
-        expected = "--tolerance 0, or the distance in the truth, such as --truth pixels:10"
-        expect(near, expected, f"the places are those of an area, the tolerance is {tolerance} places")
-        tolerance = 0
-    if place_map is not None and place_map.area is not None:
-        reference = reference or _windows(place_map.area, str(map))
-        own = same_windows(reference.area, place_map.area)
+    layout = ROUTE if place_map is None else place_map.layout
+    if layout.has_north and reference is None:
+        reference = _windows(layout, str(map))
+    if reference is not None and place_map is not None and layout.has_north:
+        own = reference.layout.same(layout)
         expect(own, "that of the map, or no reference", f"{reference.name} is not the area of {map}")
+    layout = layout if reference is None else reference.layout
+    near = parsed if isinstance(parsed, Near) else None
+    if near is not None:
+        check_unit(near, layout)
+    elif tolerance:  # numbers of places tell no distance over an area
+        expected = "--tolerance 0, or the distance in the truth, such as --truth pixels:10"
+        layout.expect_route(expected, f"the places are those of an area, the tolerance is {tolerance} places")
+    tolerance = layout.reach(tolerance).tolerance
     positions = torch.zeros(0, dtype=torch.float32) if place_map is None else place_map.positions
     resampled = len(positions) > 0
     frames = places = None if reference is None else len(reference)
@@ -147,8 +149,8 @@ def evaluate_file(
         log.warning(line, TOLERANCE, reach)
     described = describe_ground_truth(truth, interpolate, carried)
     facts = evaluation_facts(match, candidates, known, tolerance, positions, described) | alone
-    if near is not None and area is not None:
-        facts |= {"tolerance": plain_number(near.radius), "unit": "pixels" if area.unit == "px" else "metres"}
+    if near is not None and layout.units:
+        facts |= {"tolerance": plain_number(near.radius), "unit": layout.units}
     if isinstance(parsed, Near) and loops is None and reference is not None and query is not None:
         stored, asked = coordinates_of([reference, query], parsed.kind)
         frames_found = here.index if place_map is None else place_map.frame_of(here.index)
@@ -174,18 +176,16 @@ def evaluate_file(
 def _map_of(map: Path, route: str | None) -> PlaceMap:
     """The map of a file, or that of one of its routes."""
     place_map = read_place_map(map)
-    if not isinstance(place_map, SpectralMap) or not place_map.routes:
-        return place_map
-    names = ", ".join(part.name for part in place_map.routes)
-    expect(route, "--route with the one of the truth", f"{map} has the routes {names}")
-    return place_map.part(str(route))
+    if route is None:
+        place_map.layout.expect_one("--route with the one of the truth", f"{map} has the routes {{}}")
+    return place_map.part(str(route)) if isinstance(place_map, SpectralMap) and route else place_map
 
 
-def _windows(area: Area, name: str) -> Traverse:
+def _windows(layout: Layout, name: str) -> Traverse:
     """The places of a map as a traverse with their coordinates."""
-    windows = ArrayTraverse(torch.zeros(area.places, 1), name)
-    windows.coordinates = Coordinates(area.coordinates(torch.arange(area.places)), frame=area.frame)
-    windows.area = area
+    windows = ArrayTraverse(torch.zeros(layout.places, 1), name)
+    windows.coordinates = Coordinates(layout.coordinates(torch.arange(layout.places)), frame=layout.frame)
+    windows.layout = layout
     return windows
 
 

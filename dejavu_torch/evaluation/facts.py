@@ -27,6 +27,7 @@ from dejavu_torch.types import Facts, Match
 
 QUANTILES = 0.5, 0.9, 0.99  # of errors in metres
 WINDOWS = 1, 2, 5  # or metres, within which answers are counted
+LINES = {1: True, 2: False}  # whether answers that lie on a line are told, by the dimensions of a layout
 STANDING, FAR = 0.01, 256  # of the distance between places drawn at random: a camera that stands still
 
 
@@ -102,12 +103,11 @@ def match_facts(
     ranked, shown = place_map.table.scored(candidates.index), run.match.renumbered(place_map.frame_of)
     facts = evaluation_facts(run.scored, ranked, run.truth, tolerance, place_map.positions, words, off)
     alone = answer_facts(shown, run.query_frames, tolerance, run.truth is not None, offset)
-    if run.matching.apart is not None or place_map.area is not None:
+    if run.matching.apart is not None or not LINES[place_map.layout.dimensions]:
         alone.pop("line", None)  # a second lap lies on one
-    if place_map.area is not None:
-        size = {"area": {"rows": place_map.area.rows, "columns": place_map.area.columns}}
+    if extent := place_map.layout.extent:
         radius, unit = run.reach
-        alone |= size | {"unit": unit, "tolerance": plain_number(radius), "truth": words}
+        alone |= extent | {"unit": unit, "tolerance": plain_number(radius), "truth": words}
     return facts | alone
 
 
@@ -132,10 +132,9 @@ def metric_facts(run: Localization, truth: Truth | None) -> Facts:
             quantiles = distance[chosen].quantile(torch.tensor(QUANTILES, dtype=torch.float64)).tolist()
             facts[name] = {f"{share:g}": round(at, 3) for share, at in zip(QUANTILES, quantiles, strict=True)}
     shares: Facts = {}
-    if (area := run.model.map.area) is not None:
-        each = 1.0 if area.unit == "m" else math.hypot(*area.right)
+    if radii := run.model.map.layout.radii(WINDOWS):
         asked_of, far = asked.isfinite().all(1), distance.masked_fill(~known, math.inf)
-        near = {f"{each * n:g}": float((far[asked_of] <= each * n).double().mean()) for n in WINDOWS}
+        near = {f"{radius:g}": float((far[asked_of] <= radius).double().mean()) for radius in radii}
         shares = {"recall_within": near} if asked_of.any() else {}
     if run.matching.apart is None:
         shares |= shift_facts(parsed, run.match, found, asked)

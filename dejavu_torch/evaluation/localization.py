@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import replace
 from typing import NamedTuple
@@ -11,11 +10,11 @@ import torch
 from torch import Tensor
 
 from dejavu_torch.data.ground_truth import GroundTruth, scored_and_right
-from dejavu_torch.data.positions import unit_of
 from dejavu_torch.data.turning import Turned, facing_north
 from dejavu_torch.evaluation.contenders import Contender, contend
 from dejavu_torch.model import DejaVu
 from dejavu_torch.motion.resampling import ResampledTraverse
+from dejavu_torch.places.positions import unit_of
 from dejavu_torch.recognition.centring import set_apart
 from dejavu_torch.recognition.drive import DriveQuery
 from dejavu_torch.recognition.filter import PlaceFilter
@@ -42,8 +41,8 @@ class Localization(NamedTuple):
     causal_features: the queries for sequences and filters, if query_features are centred, which takes all
     of them. match: the answers. judged: the matches that the scores at top level judge, with those of
     other models. smoother: of the answers, if they are those of the whole drive. beside: one to compare
-    all contenders by, if any. radius: in an area, the distance within which a match is right, in the unit
-    of its coordinates; tolerance is 0.
+    all contenders by, if any. radius: over an area, the distance within which a match is right, in the unit
+    of its coordinates; tolerance is 0. Along a route the tolerance once more.
 
     Convention 11: match and truth count places and queries, pictures show frames of the sources.
     """
@@ -74,7 +73,7 @@ class Localization(NamedTuple):
     @property
     def asked(self) -> Traverse:
         """The frames whose descriptors the queries have: all turned copies, if several headings are tried."""
-        return facing_north(self.query, self.model.map.area, self.matching.copies)
+        return facing_north(self.query, self.model.map.layout, self.matching.copies)
 
     def described_by(self, model: DejaVu, progress: bool = False) -> Tensor:
         """The descriptors of the queries by a model, those of turned images by `set_apart`."""
@@ -95,14 +94,12 @@ class Localization(NamedTuple):
         """The queries as a drive with the scores of another map, if a smoother is compared."""
         if self.beside is None:
             return None
-        area = self.model.map.area
-        return drive_query(self.query_features, self.beside, score, area)
+        return drive_query(self.query_features, self.beside, score, self.model.map.layout)
 
     @property
     def coarsest(self) -> int:
         """The largest stride of stored frames that lets every place be found: twice the tolerance."""
-        area = self.model.map.area
-        return max(1, 2 * self.tolerance if area is None else int(2 * self.radius / math.hypot(*area.right)))
+        return max(1, 2 * self.tolerance, int(2 * self.radius / self.model.map.layout.spacing))
 
     @property
     def answers(self) -> str:
@@ -145,10 +142,7 @@ class Localization(NamedTuple):
     @property
     def reach(self) -> tuple[float, str]:
         """The tolerance and its unit: in an area a distance."""
-        area = self.model.map.area
-        if area is None:
-            return self.tolerance, self.unit
-        return self.radius, "metres" if area.unit == "m" else "pixels"
+        return max(self.tolerance, self.radius), self.model.map.layout.units or self.unit
 
     @property
     def within(self) -> str:

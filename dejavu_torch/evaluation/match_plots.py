@@ -13,11 +13,11 @@ from torch import Tensor
 from torch.nn.functional import max_pool1d
 
 from dejavu_torch.data.ground_truth import GroundTruth, scored_and_right
-from dejavu_torch.data.positions import look_up
 from dejavu_torch.evaluation import plots
 from dejavu_torch.evaluation.contenders import COLOURS
 from dejavu_torch.evaluation.localization import Localization, faults, frame_at, nearest_query
 from dejavu_torch.motion.resampling import source_of
+from dejavu_torch.places.positions import look_up
 from dejavu_torch.recognition.filter import PlaceFilter
 from dejavu_torch.types import Facts, Match, Traverse
 

@@ -6,7 +6,7 @@ import csv
 import itertools
 import logging
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
@@ -15,10 +15,10 @@ from typing import NamedTuple, TextIO
 import torch
 from torch import Tensor
 
-from dejavu_torch.area import Area
 from dejavu_torch.data.files import as_number, read_rows
 from dejavu_torch.data.output import whole_file
-from dejavu_torch.maps.frame_table import Route
+from dejavu_torch.places.frame_table import FrameTable
+from dejavu_torch.places.layout import ROUTE
 from dejavu_torch.text import printable
 from dejavu_torch.types import InputError, Match
 
@@ -49,26 +49,22 @@ def write_matches(
     path: Path,
     matches: Iterable[Match],
     query_frames: Tensor | None = None,
-    frame_of: Callable[[Tensor], Tensor] | None = None,
+    table: FrameTable | None = None,
     query_names: Sequence[str] = (),
     place_names: Sequence[str] = (),
     ranks: int | None = None,
-    routes: Sequence[Route] = (),
     pairs: Path | None = None,
-    area: Area | None = None,
 ) -> tuple[int, int]:
     """Write batches of matches as a csv; return the numbers of (queries, queries with an accepted match).
 
     Args:
         matches: one per query, in order; with `ranks`, that many per query, the best first.
         query_frames: (Q,) int64, the source frame of each query; None: query i is frame i.
-        frame_of: the reference frame of each place, as `PlaceMap.frame_of`; None: place i is frame i.
+        table: of the map: the reference frame of each place; of a merged map with the name of its route, and
+            of an area with x and y of the middles of windows. None: place i is frame i.
         query_names, place_names: of the frames; () leaves the column empty. Unprintable characters, such as
             line breaks, are escaped.
         ranks: matches per query; None is one, without a column for the rank.
-        routes: of a merged map, for `Match.route`: their names get a column, and the place is a frame of that
-            route. `frame_of` and `place_names` count through all routes.
-        area: of the places: x and y of the middles of windows get columns.
         pairs: another file, with a line `query_name place_name` for each reported place: the image pairs
             that hloc and COLMAP read.
 
@@ -76,14 +72,12 @@ def write_matches(
     """
     total = accepted = 0
     each = 1 if ranks is None else ranks
-    starts = list(itertools.accumulate((route.frames for route in routes), initial=0))
+    table = FrameTable(ROUTE, torch.zeros(0)) if table is None else table
+    layout, names = table.layout, table.layout.routes
     matches = iter(matches)
     start = next(matches, None)
-    known = [
-        name
-        for name in ("probability", "confidence", "heading")
-        if start is not None and name in start.columns
-    ]
+    present = {} if start is None else start.columns
+    known = [name for name in ("probability", "confidence", "heading") if name in present]
     with ExitStack() as stack:
 
         def opened(path: Path) -> TextIO:
@@ -91,7 +85,7 @@ def write_matches(
             return stack.enter_context(temporary.open("w", newline="", encoding="utf-8"))
 
         file, paired = opened(path), None if pairs is None else opened(pairs)
-        others = ["rank"] * (ranks is not None) + ["route"] * bool(routes) + ["x", "y"] * (area is not None)
+        others = ["rank"] * (ranks is not None) + ["route"] * bool(names) + [*layout.axes]
         columns = [*NUMBERS, *known, *others, *NAMES]
         writer = csv.DictWriter(file, columns, extrasaction="ignore")
         writer.writeheader()
@@ -99,30 +93,28 @@ def write_matches(
             digits = 17 if match.score.dtype == torch.float64 else 9  # exact when read again
             first, total = total, total + len(match.index) // each
             queries = torch.arange(first, total) if query_frames is None else query_frames[first:total]
-            places = match.index if frame_of is None else frame_of(match.index)
+            places, own = table.frame_of(match.index), table.own_frame_of(match.index)
             rank = torch.arange(each).repeat(len(queries)) + 1
             right, sure, turn = (
                 match.columns.get(name, match.score) for name in ("probability", "confidence", "heading")
             )
-            route = match.route if routes and match.route is not None else torch.full_like(places, -1)
-            nowhere = torch.full((*places.shape, 2), math.nan)
-            at = nowhere if area is None else area.coordinates(places.clamp(min=0))
-            whole = queries.repeat_interleave(each), places, match.accepted, rank, route
-            parts = match.score, right, sure, turn, *at.masked_fill((places < 0)[:, None], math.nan).unbind(1)
-            for (query, place, good, order, on), (score, chance, margin, north, x, y) in zip(
+            route, at = layout.route_of(match.index), layout.coordinates(match.index)
+            whole = queries.repeat_interleave(each), places, own, match.accepted, rank, route
+            parts = match.score, right, sure, turn, *at.unbind(1)
+            for (query, place, number, good, order, on), (score, chance, margin, north, x, y) in zip(
                 *(zip(*(column.tolist() for column in columns), strict=True) for columns in (whole, parts)),
                 strict=True,
             ):
                 row = {
                     "query": query,
-                    "place": place - starts[on] if on >= 0 else place,
+                    "place": number,
                     "score": f"{score:.{digits}g}",
                     "accepted": int(good),
                     "probability": _number(chance),
                     "confidence": _number(margin),
                     "heading": _number(north),
                     "rank": order,
-                    "route": printable(routes[on].name) if on >= 0 else "",
+                    "route": printable(layout.names("")[on]) if on >= 0 else "",
                     "x": _number(x, 9),
                     "y": _number(y, 9),
                     "query_name": _name(query_names, query),
@@ -177,7 +169,7 @@ def read_matches(path: Path, route: str | None = None, repeats: bool = False) ->
     answers: list[_Answer] = []  # of rank 1
     ranked: list[list[int]] = []
     seen: set[int] = set()
-    routes: dict[str, None] = {}
+    named: dict[str, None] = {}
     for where, cells in _rows(path):
         answer = _answer(where, cells)
         query, rank, last = answer.query, answer.rank, answers[-1].query if answers else None
@@ -191,7 +183,7 @@ def read_matches(path: Path, route: str | None = None, repeats: bool = False) ->
         if route is not None and "route" not in cells:
             raise InputError(f"{where}: no column route for --route {route}; expected no --route")
         if "route" in cells and answer.place >= 0:
-            routes[cells["route"]] = None
+            named[cells["route"]] = None
             answer = answer if cells["route"] == route else answer._replace(place=ELSEWHERE)
         if rank == 1:
             answers.append(answer)
@@ -201,10 +193,10 @@ def read_matches(path: Path, route: str | None = None, repeats: bool = False) ->
     if not answers:
         raise InputError(f"{path} holds no matches; expected a line for each query")
     if route is None and "route" in cells:
-        known = f", with answers on {', '.join(routes)}" if routes else ""
+        known = f", with answers on {', '.join(named)}" if named else ""
         raise InputError(f"{path} has a column route{known}; expected --route with the one of the truth")
-    if route is not None and route not in routes:
-        known = f"; it has answers on {', '.join(routes)}" if routes else ""
+    if route is not None and route not in named:
+        known = f"; it has answers on {', '.join(named)}" if named else ""
         log.warning("%s: no answer is on route %s%s", path, route, known)
     for one, places in zip(answers, ranked, strict=True):
         if len(places) != len(ranked[0]):

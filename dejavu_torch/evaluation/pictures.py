@@ -29,17 +29,22 @@ def draw_pictures(run: Localization, contenders: Mapping[str, Contender]) -> Pic
     """All pictures that can be drawn; some need ground truth, frames or layers."""
     place_map = run.model.map
     pictures = draw_examples(run) | draw_pairs(run)
-    if place_map.area is not None:
-        pictures |= draw_area(run) | draw_heat(run)
-    else:
-        seen = run.borders, run.query_frames, run.unit
-        by_one = run.by_one if run.answers == "drive" else None
-        pictures |= draw_coverage(run.scored, run.truth, run.tolerance, *seen, by_one)
-        pictures |= draw_scores(run) | draw_posterior(run)
+    pictures |= {1: _along_route, 2: _over_area}[place_map.layout.dimensions](run)
     pictures |= draw_compared(run, contenders) | draw_motion(run)
     if isinstance(place_map, TemplateMap):
         pictures |= draw_template_map(run, place_map)
     return pictures
+
+
+def _along_route(run: Localization) -> Pictures:
+    seen = run.borders, run.query_frames, run.unit
+    by_one = run.by_one if run.answers == "drive" else None
+    coverage = draw_coverage(run.scored, run.truth, run.tolerance, *seen, by_one)
+    return coverage | draw_scores(run) | draw_posterior(run)
+
+
+def _over_area(run: Localization) -> Pictures:
+    return draw_area(run) | draw_heat(run)
 
 
 @in_float32()

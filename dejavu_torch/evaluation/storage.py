@@ -98,7 +98,7 @@ def _coded(
     mapper = SpectralMapper(budget, None, place_map.chunk, place_map.transform, place_map.metric, resolution)
     model = with_mapper(run.model, mapper)
     try:
-        model.learn_features(features, area=place_map.area)
+        model.learn_features(features, layout=place_map.layout)
     except InputError:  # more than floats, or less than the mean
         return
     found = model.localize_descriptors(run.query_features, run.matching, order)

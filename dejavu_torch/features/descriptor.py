@@ -268,7 +268,7 @@ class Descriptor(nn.Module):
                     self._learn_whitening(whitening, features, traverse, second, progress)
                     parts = features.split(ROWS)
                     return concatenate((self.whitened(part.to(self.device)) for part in parts), len(features))
-                sample = Sample.of(len(traverse), SAMPLE)
+                sample = Sample.of_route(traverse.layout, SAMPLE)
                 views = second and sample.views(second)
                 self.learn(Part(traverse, sample.frame), views, progress, verb="sampling")
             storage = (DESCRIPTOR_MEMORY, self.whitening is not None) if spectral else ()

@@ -52,16 +52,16 @@ class Windows(NamedTuple):
             return None
         if isinstance(traverse, Blocks):
             starts = [*accumulate((rows * columns for rows, columns in traverse.sizes[:-1]), initial=0)]
-            corners = grid.area.cells(torch.as_tensor(traverse.frame)[starts]).tolist()
+            corners = grid.layout.cells(torch.as_tensor(traverse.frame)[starts]).tolist()
             return cls(grid, [((y, x), size) for (y, x), size in zip(corners, traverse.sizes, strict=True)])
         if isinstance(traverse, Part):
             if not isinstance(traverse.frame, range) or traverse.frame.step != 1:
                 return None
             frames = traverse.frame
-        ends = [*accumulate((rows * columns for rows, columns in grid.area.tiles), initial=0)]
+        ends = [*accumulate((rows * columns for rows, columns in grid.layout.tiles), initial=0)]
         if not {frames.start, frames.stop} <= {*ends}:
             return None
-        tiles = [*zip(grid.area.corners, grid.area.tiles, strict=True)]
+        tiles = [*zip(grid.layout.corners, grid.layout.tiles, strict=True)]
         return cls(grid, tiles[ends.index(frames.start) : ends.index(frames.stop)])
 
 
@@ -129,7 +129,7 @@ class Sharing(NamedTuple):
     def offset(self, grid: Grid) -> Tensor:
         """The mean difference (D,) of features of windows alone to those of `batches`, of some all over
         the picture."""
-        rows, columns = grid.area.rows, grid.area.columns
+        rows, columns = grid.layout.rows, grid.layout.columns
         tall, wide = min(SIDE, rows), min(SIDE, columns)
         tops = torch.linspace(0, rows - tall, min(BLOCKS, rows // tall)).round().long()
         lefts = torch.linspace(0, columns - wide, min(BLOCKS, columns // wide)).round().long()
@@ -137,7 +137,7 @@ class Sharing(NamedTuple):
         every, differences, shows = max(1, len(inside) // ALONE), [], []
         for top, left in torch.cartesian_prod(tops, lefts).view(-1, 2).tolist():
             shared, shown = self._described(grid, (top, left), (tall, wide))
-            places = grid.area.place_at(torch.tensor([top, left]) + inside[::every])
+            places = grid.layout.place_at(torch.tensor([top, left]) + inside[::every])
             differences.append(self.features(grid[places.tolist()].to(self.device)) - shared[::every])
             shows.append(shown[::every])
         shown = torch.cat(shows)

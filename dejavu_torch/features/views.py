@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import accumulate
 from typing import NamedTuple, cast
 
 import torch
 from torch import Tensor
 
-from dejavu_torch.area import Area
 from dejavu_torch.data.traverse import Part, as_shape
 from dejavu_torch.features.augmentation import LARGEST, Augmentation
 from dejavu_torch.features.preprocess import spread
+from dejavu_torch.places.layout import Layout
 from dejavu_torch.types import Facts, InputError, Traverse, expect
 
 SAMPLE = 10_000  # frames that a longer route is fitted on
@@ -37,22 +37,27 @@ class Sample(NamedTuple):
     sizes: list[tuple[int, int]]  # rows and columns of each; of a route one column
 
     @classmethod
-    def of(cls, frames: int, chunk: int, area: Area | None = None) -> Sample:
+    def of(cls, layout: Layout, chunk: int) -> Sample:
         """The sample of a route longer than `SAMPLE`, coded in chunks of `chunk` places, or of an area.
 
         Example:
-            >>> sample = Sample.of(100_000, chunk=1000)
+            >>> sample = Sample.of(Layout(100_000), chunk=1000)
             >>> len(sample.frame), sample.frame[::1000].tolist()
             (10000, [0, 11000, 22000, 33000, 44000, 55000, 66000, 77000, 88000, 99000])
         """
-        if area is not None:
-            return cls.of_area(area)
+        ways: dict[int, Callable[[Layout, int], Sample]] = {1: cls.of_route, 2: cls.of_area}
+        return ways[layout.dimensions](layout, chunk)
+
+    @classmethod
+    def of_route(cls, layout: Layout, chunk: int) -> Sample:
+        """Evenly spaced segments of a route."""
+        frames = layout.places
         segment = min(chunk, SAMPLE // MIN_SEGMENTS)
         count = SAMPLE // segment
         return cls(evenly_spaced(frames, segment, count), segment, [(segment, 1)] * count)
 
     @classmethod
-    def of_area(cls, area: Area) -> Sample:
+    def of_area(cls, area: Layout, chunk: int = 0) -> Sample:
         """Evenly spaced blocks of an area: of few large ones more is learned than of many."""
         size = OF_AREA // MIN_SEGMENTS
         side = round(size**0.5)
@@ -68,8 +73,15 @@ class Sample(NamedTuple):
         return cls(places, tall * wide, [(tall, wide)] * len(drawn))
 
     @classmethod
-    def of_tiles(cls, area: Area) -> Sample:
-        """Whole tiles of an area: blocks are coded in more bytes."""
+    def of_chunks(cls, layout: Layout, sample: Sample) -> Sample:
+        """What the step is chosen in: the sample itself of a route; of an area whole tiles, since blocks are
+        coded in more bytes."""
+        ways: dict[int, Callable[[Layout], Sample]] = {1: lambda _: sample, 2: cls.of_tiles}
+        return ways[layout.dimensions](layout)
+
+    @classmethod
+    def of_tiles(cls, area: Layout) -> Sample:
+        """Whole tiles of an area."""
         starts = [*accumulate((rows * columns for rows, columns in area.tiles), initial=0)]
         drawn = torch.linspace(0, len(starts) - 2, min(TILES, len(starts) - 1)).round().long().tolist()
         places = torch.cat([torch.arange(starts[i], starts[i + 1]) for i in drawn])

@@ -154,19 +154,18 @@ class LiveLocalizer:
     def _live(self, match: Match, milliseconds: float) -> LiveMatch:
         model = self.model
         place, score, table = int(match.index), float(match.score), model.map.table
-        shown, routes = int(table.frame_of(match.index)), model.map.routes
-        area, nowhere = model.map.area, [math.nan, math.nan]
-        x, y = nowhere if area is None or place < 0 else area.coordinates(match.index).tolist()
+        shown, layout = int(table.frame_of(match.index)), model.map.layout
+        x, y = layout.coordinates(match.index).tolist()
         return LiveMatch(
             place=place,
-            frame=int(table.own_frame_of(match.index)) if routes else shown,
+            frame=int(table.own_frame_of(match.index)),
             name=model.frame_names[shown] if model.frame_names and shown >= 0 else "",
             score=score,
             posterior=math.exp(-score) if isinstance(self.sequence, PlaceFilter) else math.nan,
             probability=math.nan if match.probability is None else float(match.probability),
             accepted=bool(match.accepted),
             milliseconds=milliseconds,
-            route=routes[int(match.route)].name if match.route is not None and place >= 0 else "",
+            route=layout.names("")[int(layout.route_of(match.index))] if place >= 0 else "",
             x=x,
             y=y,
         )

@@ -5,18 +5,17 @@ from __future__ import annotations
 import logging
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
-from itertools import accumulate
 from typing import ClassVar, TypeVar, get_args
 
 import torch
 from torch import Tensor, nn
 from typing_extensions import Self
 
-from dejavu_torch.area import Area
-from dejavu_torch.data.positions import count_places
-from dejavu_torch.maps.frame_table import FrameTable, Link, Route
 from dejavu_torch.maps.summary import MapSummary
-from dejavu_torch.places.layout import Layout
+from dejavu_torch.places.frame_table import FrameTable, Route
+from dejavu_torch.places.layout import ROUTE, Layout
+from dejavu_torch.places.positions import count_places
+from dejavu_torch.places.states import Link
 from dejavu_torch.text import one_line
 from dejavu_torch.types import Facts, InputError, check_shape, expect
 
@@ -49,7 +48,9 @@ class PlaceMap(nn.Module, ABC):
         positions: (F,) float32, even steps of each reference frame from the first place of its route, if
             resampled (section IV-B); (0,) if place i is reference frame i.
         visits: (V,2) int32, runs of places and the number of visits that they average; (0,2) if all are 1.
-        routes: of a merged map, in order, else (). Places and frames are numbered through all of them.
+        layout: where the places lie, stored with the map: along a route, several, or over an area. area: the
+            same, None along routes. routes: of a merged map, in order, else (). Places and frames are
+            numbered through all of them.
 
     Shape: queries (Q,D) -> scores (Q,N), lower is better, +inf for a place that nothing covers.
 
@@ -60,8 +61,7 @@ class PlaceMap(nn.Module, ABC):
     kind: ClassVar[str]
     kept: ClassVar[tuple[str, ...]] = ("positions",)  # tensors that are always of the type of a file
     optional: ClassVar[Mapping[str, tuple[int, ...]]] = {"visits": (0, 2)}  # that files may lack
-    routes: tuple[Route, ...] = ()
-    area: Area | None = None
+    _layout: Layout = ROUTE
     positions: Tensor
     visits: Tensor
 
@@ -113,23 +113,39 @@ class PlaceMap(nn.Module, ABC):
 
     @property
     def layout(self) -> Layout:
-        """Where the places lie."""
-        return self.area or Layout(self.places)
+        return self._layout.reaching(self.places)
+
+    @layout.setter
+    def layout(self, layout: Layout) -> None:
+        self._layout = layout
+
+    def laid_out(self, layout: Layout) -> Self:
+        """Let its places lie so; returns itself."""
+        self.layout = layout
+        return self
+
+    @property
+    def area(self) -> Layout | None:
+        return self.layout.area
+
+    @property
+    def routes(self) -> tuple[Route, ...]:
+        return self.table.routes
 
     @property
     def table(self) -> FrameTable:
         """The frame and route of each place."""
-        return FrameTable(self.places, self.positions, self.routes)
+        return FrameTable(self.layout, self.positions)
 
     @property
     def route_starts(self) -> tuple[int, ...]:
-        """The first place of each route."""
-        return (0, *accumulate(route.places for route in self.routes[:-1]))
+        """The first place of each route, or of each part of one."""
+        return self.layout.starts
 
     @property
     def connections(self) -> tuple[Link, ...]:
-        """Steps from one route to another, see `PlaceSmoother`."""
-        return ()
+        """Steps from one route to another, or from a part of a route to the next, see `PlaceSmoother`."""
+        return self.layout.joins
 
     def frame_of(self, places: Tensor) -> Tensor:
         """The reference frame of each place, see `FrameTable`."""
@@ -183,13 +199,15 @@ class PlaceMap(nn.Module, ABC):
 
     def get_extra_state(self) -> Facts:
         """The state besides the tensors."""
-        return {"kind": self.kind, "places": self.places, "dimension": self.dimension, **self.settings()}
+        own = {"kind": self.kind, "places": self.places, "dimension": self.dimension, **self.settings()}
+        return own | self.layout.stored()
 
     def set_extra_state(self, state: Facts) -> None:
         """Restore the result of `get_extra_state`; another kind or other settings are an InputError."""
         for name, value in {"kind": self.kind, **self.settings()}.items():
             expect(state.get(name) == value, repr(value), f"the map's {name} is {state.get(name)!r}")
         self.places, self.dimension = state["places"], state["dimension"]
+        self.layout = Layout.restored(state, self.places)
 
     def _load_from_state_dict(self, state_dict: Facts, prefix: str, *args: object) -> None:
         if not any(name.startswith(prefix) for name in state_dict):  # the state of other parts of a model

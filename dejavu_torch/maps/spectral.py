@@ -8,12 +8,12 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from dejavu_torch.area import Area
 from dejavu_torch.maps.codec import encode
 from dejavu_torch.maps.place_map import Mapper
 from dejavu_torch.maps.quantisation import RouteLines
 from dejavu_torch.maps.spectral_map import CHUNK_BYTES, Chunk, SpectralMap, SpectralMetric
 from dejavu_torch.maps.spectrum import Transform
+from dejavu_torch.places.layout import ROUTE, Layout
 from dejavu_torch.text import settings_of
 from dejavu_torch.types import InputError, expect
 
@@ -37,7 +37,7 @@ class SpectralMapper(Mapper):
             squared errors / squared differences from the mean. The step is the largest that holds it. None,
             without bytes and step, is .85, or more if 5 bytes per place hold more, as with few features.
 
-    Shape: descriptors (N,K) -> SpectralMap of N places; with an `Area` of as many places, of that.
+    Shape: descriptors (N,K) -> SpectralMap of N places; with a `Layout` of as many places, of that.
 
     Convention: the written route takes 98 to 100 % of the budget, or less if the finest useful step needs
         less. Without `resolution` a map holds at least `hold`, unless that step holds less; a long route is
@@ -85,15 +85,14 @@ class SpectralMapper(Mapper):
         return cls(size, None, place_map.chunk, place_map.transform, place_map.metric)
 
     @torch.no_grad()
-    def forward(self, features: Tensor, area: Area | None = None) -> SpectralMap:
+    def forward(self, features: Tensor, layout: Layout = ROUTE) -> SpectralMap:
         check_descriptors(features)
-        sizes = line_sizes(len(features), self.chunk)
-        if area is not None:
-            seen = f"{len(features)} descriptors of an area of {area.rows} x {area.columns} places"
-            expect(len(features) == area.places, "one for each", seen)
-            sizes = area.tiles
+        layout = layout.reaching(len(features))
+        seen = f"{len(features)} descriptors of {layout.kind} of {layout.rows} x {layout.columns} places"
+        expect(len(features) == layout.places, "one for each", seen)
+        sizes = layout.sizes(self.chunk)
         place_map, lines = self._fitted(features, sizes)
-        place_map.area = area
+        place_map.laid_out(layout)
         for (start, stop), (_, columns), levels in zip(
             lines.chunks, sizes, lines.levels(place_map.step), strict=True
         ):
@@ -143,16 +142,6 @@ class SpectralMapper(Mapper):
             expected += f", and at most {most}, with all numbers as floats"
             raise InputError(f"route_bytes_per_place is {budget:g}; expected {expected}")
         return lines.step_of(budget * places - fixed)
-
-
-def line_sizes(places: int, chunk: int) -> list[tuple[int, int]]:
-    """Rows and columns, one, of the chunks of a route.
-
-    Example:
-        >>> line_sizes(25, 10)
-        [(10, 1), (10, 1), (5, 1)]
-    """
-    return [(min(chunk, places - start), 1) for start in range(0, places, chunk)]
 
 
 @torch.no_grad()

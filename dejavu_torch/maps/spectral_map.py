@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import bisect
 import copy
 import math
 import warnings
@@ -16,13 +15,13 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from dejavu_torch.area import Area, apart, area_of, stored_area
 from dejavu_torch.maps.codec import Stream, decode
-from dejavu_torch.maps.frame_table import Link, Route
 from dejavu_torch.maps.place_map import PlaceMap, ScoreBlocks, one_of, require
 from dejavu_torch.maps.spectrum import Transform, by_frequency, frequencies, from_lines, from_slots, slots
 from dejavu_torch.maps.summary import ChunkSummary, MapSummary
 from dejavu_torch.memory import is_readable
+from dejavu_torch.places.layout import Layout
+from dejavu_torch.places.states import Link
 from dejavu_torch.types import Facts, InputError, expect
 
 SpectralMetric = Literal["cosine", "l2"]
@@ -98,7 +97,7 @@ class SpectralMap(PlaceMap):
             places that no frame shows (0 visits), whose scores are +inf.
 
     Attributes:
-        chunks: the places [start, stop) of each. area: the rows and columns of an area; None for a route.
+        chunks: the places [start, stop) of each.
 
     Args:
         means: as above; None makes a map that can load any state.
@@ -158,7 +157,6 @@ class SpectralMap(PlaceMap):
         self.transform: Transform = one_of(transform, Transform, "transform")
         self.chunk, self.resolution = chunk, resolution
         self._step = step
-        self.area: Area | None = None
         for name in ("counts", "feature", "level", "norms"):
             self.register_buffer(name, None, persistent=False)
         for name, (dtype, ndim) in FILE.items():
@@ -207,9 +205,9 @@ class SpectralMap(PlaceMap):
 
         for name, column in zip(("counts", "feature", "level"), zip(*parts, strict=True), strict=True):
             append(name, *column)
-        if len(self.columns) or any(chunk.columns > 1 for chunk in chunks):
-            before = self.columns if len(self.columns) else self.lengths.new_ones(len(self.lengths)).int()
-            self.columns = torch.cat([before, before.new_tensor([chunk.columns for chunk in chunks])])
+        self._widths += [chunk.columns for chunk in chunks]
+        if max(self._widths) > 1:
+            append("columns", self.columns.new_tensor(self._widths[len(self.columns) :]))
         append("lengths", torch.tensor(places))
         append("steps", self.steps.new_tensor([chunk.step for chunk in chunks]))
         append("stream_table", torch.tensor([[len(c.stream.bytes), c.stream.checksum] for c in chunks]))
@@ -223,7 +221,6 @@ class SpectralMap(PlaceMap):
         for chunk, (*_, level) in zip(chunks, parts, strict=True):
             self.chunks.append((self.places, self.places + chunk.places))
             self._bounds.append(self._bounds[-1] + len(level))
-            self._widths.append(chunk.columns)
             self.places += chunk.places
         norms = [*map(self._norms_of, range(len(self.chunks) - len(chunks), len(self.chunks)))]
         append("norms", *norms)
@@ -254,7 +251,7 @@ class SpectralMap(PlaceMap):
     def _routes_of(self, chunks: range) -> Tensor:
         """The route of each chunk."""
         starts = torch.tensor([self.chunks[g][0] for g in chunks], device=self.device)
-        return self.table.route_of(starts) if self.routes else torch.zeros_like(starts)
+        return self.layout.route_of(starts)
 
     def coded(self) -> list[Chunk]:
         """The chunks as a file stores them, for `extend`."""
@@ -264,8 +261,12 @@ class SpectralMap(PlaceMap):
         unseen = [
             tuple((counts == 0).nonzero()[:, 0].tolist()) for counts in self.visit_counts.split(lengths)
         ]
-        columns = self.columns.tolist() or [1] * len(lengths)
-        return [*map(Chunk, lengths, self.steps.tolist(), streams, unseen, columns)]
+        return [*map(Chunk, lengths, self.steps.tolist(), streams, unseen, self._columns())]
+
+    def _columns(self) -> list[int]:
+        """The columns of each chunk, from the tensors of a file."""
+        known: list[int] = self.columns.tolist()
+        return known + [1] * (len(self.lengths) - len(known))
 
     def width_of(self, chunk: int) -> int:
         """The columns of a chunk, 1 of a route."""
@@ -323,9 +324,8 @@ class SpectralMap(PlaceMap):
     def with_route(self, name: str, route: SpectralMap, own: str) -> SpectralMap:
         """A map that has the places of another at the end, as a route of this name; `own`: what its own are
         called, if they are one route."""
-        place_map = self._sharing()
-        known = self.routes or (Route(own, self.places, self.table.frames),)
-        place_map.routes = (*known, Route(name, route.places, route.table.frames))
+        place_map, known = self._sharing(), [self.table.counted, route.table.counted]
+        place_map.layout = Layout.merged(known, [self.layout.names(own), (name,)])
         place_map.means = torch.cat([self.means, route.means.to(self.means)])
         place_map.extend(route.coded())
         place_map.positions = torch.cat([self.positions, route.positions.to(self.positions)])
@@ -341,21 +341,23 @@ class SpectralMap(PlaceMap):
         return place_map
 
     @property
-    def connections(self) -> tuple[Link, ...]:
+    def known_links(self) -> tuple[Link, ...]:
+        """Those that drives have taught."""
         return tuple((one, two, share / LINK_SHARES) for one, two, share in self.links.tolist())
 
+    @property
+    def connections(self) -> tuple[Link, ...]:
+        return self.known_links + super().connections
+
     @classmethod
-    def merged(cls, parts: Sequence[SpectralMap], names: Sequence[str]) -> SpectralMap:
-        """The map of several routes, each with its own mean and steps; `growth.merge` checks the routes."""
+    def merged(cls, parts: Sequence[SpectralMap], names: Sequence[Sequence[str]]) -> SpectralMap:
+        """The map of the routes of several, which get these names, each with its own mean and steps;
+        `growth.merge` checks the maps."""
         place_map = parts[0]._without_places(torch.cat([part.means for part in parts]))
-        sizes = ((part.places, part.table.frames) for part in parts)
-        place_map.routes = tuple(Route(name, *size) for name, size in zip(names, sizes, strict=True))
-        areas = [part.area for part in parts if part.area is not None]
-        if areas:
-            place_map.area = apart(areas)
-            known = [part.turned for part in parts if len(part.turned)]
-            if known:
-                place_map.turned = torch.stack(known).float().mean(0).round().to(torch.int8)
+        place_map.layout = Layout.merged([part.table.counted for part in parts], names)
+        known = [part.turned for part in parts if len(part.turned)]
+        if known:
+            place_map.turned = torch.stack(known).float().mean(0).round().to(torch.int8)
         place_map.extend(chunk for part in parts for chunk in part.coded())
         place_map.positions = torch.cat([part.positions for part in parts])
         place_map.count_visits(torch.cat([part.visit_counts for part in parts]))
@@ -364,35 +366,30 @@ class SpectralMap(PlaceMap):
 
     def part(self, name: str) -> SpectralMap:
         """The map of one route alone; an InputError if there is no such route."""
-        names = [route.name for route in self.routes]
-        expect(name in names, f"one of {', '.join(names)}", f"there is no route {name!r}")
-        r = names.index(name)
-        before, (_, places, frames) = self.routes[:r], self.routes[r]
-        start, frame = sum(route.places for route in before), sum(route.frames for route in before)
-        starts = [first for first, _ in self.chunks]
-        part = self.between(bisect.bisect_left(starts, start), bisect.bisect_left(starts, start + places))
-        part.routes = ()
-        part.area = None if self.area is None else self.area.between(start, start + places)
-        part.positions = self.positions[frame : frame + frames]
-        part.count_visits(self.visit_counts[start : start + places])
+        r, routes, coded = self.layout.number(name), self._routes_of(range(len(self.chunks))), self.coded()
+        part = self._without_places(self.means[r : r + 1])
+        part.layout, part.positions = self.table.only(r)
+        part.extend(coded[g] for g in (routes == r).nonzero()[:, 0].tolist())
+        part.count_visits(self.visit_counts[self.layout.places_in(r).to(self.device)])
         return part
 
     def between(self, first: int, last: int) -> SpectralMap:
         """A map of the chunks [first, last), with the same scores."""
-        routes = self._routes_of(range(first, last))
-        unique, counts = routes.unique_consecutive(return_counts=True)
-        part = self._without_places(self.means[unique])
-        if self.routes:
-            sizes = [int(lengths.sum()) for lengths in self.lengths[first:last].split(counts.tolist())]
-            part.routes = tuple(Route(self.routes[r].name, n, n) for r, n in zip(unique, sizes, strict=True))
+        part = self._without_places(self.means[self._routes_of(range(first, last)).unique()])
+        part.layout = self.layout.cut(self.chunks[first][0], self.chunks[last - 1][1])
         part.extend(self.coded()[first:last])
         return part
 
     @property
+    def _sizes(self) -> list[int]:
+        """The places of each route."""
+        layout = self.layout
+        return [max(1, layout.places_of(route)) for route in range(layout.count)]
+
+    @property
     def mean(self) -> Tensor:
         """The mean descriptor of all places, (K,) float32."""
-        sizes = [route.places for route in self.routes] or [1]
-        weight = torch.tensor(sizes, dtype=torch.float32, device=self.device)
+        weight = torch.tensor(self._sizes, dtype=torch.float32, device=self.device)
         return (weight / weight.sum()) @ self.means.float()
 
     @property
@@ -401,7 +398,7 @@ class SpectralMap(PlaceMap):
         other metrics. Visits agree by about `AGREE`, by which their mean is shorter."""
         if self.metric != "cosine" or not self.places:
             return 1.0
-        sizes = torch.tensor([route.places for route in self.routes] or [self.places]).double()
+        sizes = torch.tensor(self._sizes).double()
         length = self.staged(self.means.float()).square().sum(1).double().cpu()
         common = float((length * sizes).sum() / sizes.sum()) if len(length) else 0.0
         known = self.norms[self.norms.isfinite()].double().square()
@@ -493,7 +490,7 @@ class SpectralMap(PlaceMap):
         count, length = len(chunks), (last - first) // len(chunks)
         some = slice(self._bounds[chunks.start], self._bounds[chunks.stop])
         means = queries @ self.means.to(queries).T  # (Q,R)
-        if self.routes:
+        if len(self.means) > 1:
             means = means[:, self._routes_of(chunks)]
         if (columns := self.width_of(chunks.start)) > 1:
             lines = sparse_products(queries, self.counts[first:last], self.feature[some], self.level[some])
@@ -553,13 +550,9 @@ class SpectralMap(PlaceMap):
         return {name: getattr(self, name) for name in ("metric", "transform", "chunk", "resolution")}
 
     def get_extra_state(self) -> Facts:
-        state = {**super().get_extra_state(), "routes": [route._asdict() for route in self.routes]}
-        return state if self.area is None else state | {"area": stored_area(self.area)}
-
-    def set_extra_state(self, state: Facts) -> None:
-        super().set_extra_state(state)
-        self.routes = tuple(Route(**route) for route in state["routes"])
-        self.area = area_of(state["area"]) if "area" in state else None
+        state = super().get_extra_state()
+        state.setdefault("routes", [])
+        return state
 
     def check(self) -> None:
         lengths, means = self.lengths.tolist(), self.means
@@ -570,17 +563,14 @@ class SpectralMap(PlaceMap):
         sizes, size = self.stream_table[:, 0].tolist(), len(self.streams)
         fits = min(sizes, default=0) >= 0 and sum(sizes) == size
         require(fits, f"the coded lines are {size} bytes; the table claims {sizes!s:.100}")
-        shape = max(1, len(self.routes)), self.dimension
+        shape = self.layout.count, self.dimension
         fits = means.shape in (shape, (0, self.dimension)) and bool(means.isfinite().all())
         require(not self.places or fits, f"means {tuple(means.shape)}; expected {shape} finite numbers")
-        columns = self.columns.tolist() or [1] * len(lengths)
-        fits = len(columns) == len(lengths) and all(map(_divides, columns, lengths))
-        require(fits, f"tiles of {columns!s:.100} columns; expected divisors of {lengths!s:.100}")
-        if self.area is not None:
-            tiles = [(places // width, width) for places, width in zip(lengths, columns, strict=True)]
-            wanted = f"those of {' and '.join(f'{one.rows} x {one.columns}' for one in self.area.rectangles)}"
-            require(self.area.fits, "parts of an area that do not lie beside each other")
-            require(tiles == self.area.tiles[: len(tiles)], f"tiles {tiles!s:.100}; expected {wanted}")
+        widths, given = self._columns(), len(self.columns)
+        fits = given in (0, len(lengths)) and all(map(_divides, widths, lengths))
+        require(fits, f"tiles of {widths!s:.100} columns; expected divisors of {lengths!s:.100}")
+        tiles = [(places // width, width) for places, width in zip(lengths, widths, strict=True)]
+        self.layout.expect_tiles(tiles)
         require(bool(self.stage_scale.isfinite().all()), "a stage that is not finite")
         turned, square = tuple(self.turned.shape), 2 * (self.dimension,)
         require(turned in ((0, 0), square), f"turned images {turned}; expected {square}")
@@ -588,17 +578,13 @@ class SpectralMap(PlaceMap):
         row = f"rows of two places, and a number up to {LINK_SHARES}"
         fits = bool(((links >= 0) & (links <= most)).all())
         require(fits, f"links {links.tolist()!s:.100}; expected {row}")
-        if self.routes:
-            names = [route.name for route in self.routes]
-            fits = len({*names}) == len(names) and all(names)
-            require(fits, f"names {', '.join(names)}; expected {len(names)} different ones")
         super().check()
 
     def loaded(self) -> None:
         """Decode the chunks of a file, and restore omitted means of 0."""
         chunks, visits = self.coded(), self.visits
         if self.dimension and not len(self.means):
-            self.means = self.means.new_zeros(max(1, len(self.routes)), self.dimension)
+            self.means = self.means.new_zeros(self.layout.count, self.dimension)
         self._clear()
         self.extend(chunks)
         self.visits = visits
@@ -621,8 +607,7 @@ class SpectralMap(PlaceMap):
         route["chunks"] = sum(tensor.nbytes for name, tensor in packed.items() if name not in names)
         covered = int(((self.norms > 0) & self.norms.isfinite()).sum())
         fixed = {part: size for part, size in (("stage", stage), ("turned", turned)) if size}
-        parts = () if self.area is None else self.area.rectangles
-        sizes = len(self.level), tuple((part.rows, part.columns) for part in parts)
+        sizes = len(self.level), self.layout.extents
         return MapSummary(self.kind, self.places, covered, 0, 0, tuple(chunks), route, fixed, *sizes)
 
     def _periods(self, chunk: int) -> tuple[Fraction, ...]:

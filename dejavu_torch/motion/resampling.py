@@ -7,9 +7,9 @@ import logging
 from torch import Tensor
 
 from dejavu_torch.data.ground_truth import GroundTruth, Truth, find_ground_truth
-from dejavu_torch.data.positions import NEAR, shown_frames
 from dejavu_torch.data.traverse import Part
 from dejavu_torch.motion.odometry import GroundOdometry
+from dejavu_torch.places.positions import NEAR, shown_frames
 from dejavu_torch.types import Traverse, expect
 
 log = logging.getLogger("dejavu_torch")
@@ -78,7 +78,7 @@ def resampled(
     `step`, that of a map for its queries, a single frame and features are returned unchanged too."""
     if odometry is None or isinstance(traverse, ResampledTraverse):
         return traverse
-    expect(traverse.area is None, "a route, or no --velocity", f"{traverse.name} is an area")
+    traverse.layout.expect_route("a route, or no --velocity", f"{traverse.name} is an area")
     if step is not None and (len(traverse) == 1 or len(traverse.frame_shape) == 1):
         return traverse
     return ResampledTraverse(traverse, odometry, batch_size, step, progress)

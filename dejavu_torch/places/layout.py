@@ -1,18 +1,33 @@
-"""Where places lie: rows and columns, numbered tile by tile; a route is rows of one column."""
+"""Where places lie: rectangles of rows and columns, numbered tile by tile; a route is rows of one column."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
-from itertools import accumulate
+from itertools import accumulate, groupby, islice, pairwise
 from typing import Any, NamedTuple
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
+from typing_extensions import Self
+
+from dejavu_torch.places.states import Link, States
+from dejavu_torch.text import expect
 
 SIDE = 128  # windows of a tile to a side
-GAP = 16  # windows between areas that are not of one ground: more than a camera moves from image to image
+GAP = 16  # windows between lattices in one plane: more than a camera moves from image to image
+FAR = 2**31  # places that are never near
+SPARSE = 4  # a lattice may span so many times as many rows x columns as it has windows
+NORTH, STRIDE = 1.0, 1e-3  # degrees that windows of one map may differ by, and share of a step
+
+Cell = tuple[int, int]  # row and column
+Point = tuple[float, float]  # x and y
+
+
+def _sum(one: Cell, other: Cell) -> Cell:
+    return one[0] + other[0], one[1] + other[1]
 
 
 class Tables(NamedTuple):
@@ -31,9 +46,9 @@ class Ground(NamedTuple):
             of its column. unit: of these, "px" or "m". frame: of the coordinates, see `Coordinates`.
     """
 
-    first: tuple[float, float] = (0.0, 0.0)
-    right: tuple[float, float] = (1.0, 0.0)
-    down: tuple[float, float] = (0.0, 1.0)
+    first: Point = (0.0, 0.0)
+    right: Point = (1.0, 0.0)
+    down: Point = (0.0, 1.0)
     unit: str = "px"
     frame: str = "pixels"
 
@@ -47,110 +62,304 @@ class Ground(NamedTuple):
         return pixels @ pixels.new_tensor([self.right, self.down]) + pixels.new_tensor(self.first)
 
 
-class Layout(NamedTuple):
-    """Places in rows and columns: windows over a picture of the ground, or those of a route in one column.
+class Rectangle(NamedTuple):
+    """Places in rows and columns, whose numbers follow each other.
 
     Args:
         rows, columns: of places. first: (x, y) of the middle of the first window. right, down: (x, y) from a
-            window to the next of its row, and of its column. unit: of these, "px" or "m". frame: of the
-            coordinates, see `Coordinates`, "" if unknown. corner: row and column of the first window in an
-            area of several `parts`, whose places follow each other; not all rows and columns of their bounds
-            are windows.
+            window to the next of its row, and of its column. corner: row and column of the first in the
+            lattice of its route. route: its number. frames: of the reference; None is one for each place.
+    """
+
+    rows: int
+    columns: int = 1
+    first: Point = (0.0, 0.0)
+    right: Point = (1.0, 0.0)
+    down: Point = (0.0, 1.0)
+    corner: Cell = (0, 0)
+    route: int = 0
+    frames: int | None = None
+
+    @property
+    def places(self) -> int:
+        """The number of windows."""
+        return self.rows * self.columns
+
+
+class Run(NamedTuple):
+    """Places of one route whose numbers follow each other: the route, and how many places and frames."""
+
+    route: int
+    places: int
+    frames: int
+
+
+class Reach(NamedTuple):
+    """Within which an answer is right: what is added to numbers of places, so many places, and a distance in
+    the unit of the layout."""
+
+    tolerance: int
+    within: int
+    radius: float
+
+
+class Layout:
+    """Where the places of a map lie, along a route or over an area, and all that follows from it: which are
+    near each other, where a camera can go, which frame and coordinates they have, and what they are called.
+
+    It is one or more rectangles, which lie in the lattice of their route: in one lattice places are near by
+    rows and columns, those of different routes never are. A route is a rectangle of one column, an area has
+    coordinates. Edits add rectangles, so that the number of a place never changes.
+
+    Args:
+        rows, columns: of places. first, right, down: see `Rectangle`. unit: of coordinates, "px" or "m", and
+            "" along a route, which has none; by default pixels if there are columns. frame: of the
+            coordinates, see `Coordinates`, "" if unknown.
+
+    Attributes:
+        rectangles: in the order of the places. routes: the names of several routes; () of a single one.
+        dimensions: 1 along routes, 2 over areas; what is tuned for each is a table by it, beside its user.
+        places, count: N, and the number of routes. rows, columns: of a plane in which all lie, lattices apart
+            from each other; not all rows and columns are places.
 
     Convention: places are numbered tile by tile and in a tile row by row, so that a tile is a run of places.
         Tiles are as equal as possible and have about `SIDE`^2 windows, `SIDE` to a side unless the area is
-        narrower.
+        narrower. Subclass it for places that lie otherwise, and add it to `KINDS`.
 
     Example:
         >>> area = Layout(2, 3, first=(32.0, 32.0), right=(4.0, 0.0), down=(0.0, 4.0))
         >>> area.coordinates(torch.tensor([0, 2, 3])).tolist()
         [[32.0, 32.0], [40.0, 32.0], [32.0, 36.0]]
+        >>> Layout(6).distance(torch.tensor(2), torch.tensor(5))
+        tensor(3)
     """
 
-    rows: int
-    columns: int = 1
-    first: tuple[float, float] = (0.0, 0.0)
-    right: tuple[float, float] = (1.0, 0.0)
-    down: tuple[float, float] = (0.0, 1.0)
-    unit: str = "px"
-    frame: str = ""
-    corner: tuple[int, int] = (0, 0)
-    parts: tuple[Layout, ...] = ()
+    def __init__(
+        self,
+        rows: int = 0,
+        columns: int = 1,
+        first: Point = (0.0, 0.0),
+        right: Point = (1.0, 0.0),
+        down: Point = (0.0, 1.0),
+        unit: str | None = None,
+        frame: str = "",
+    ) -> None:
+        self._set([Rectangle(rows, columns, first, right, down)], unit, frame)
+
+    def _set(
+        self, rectangles: Sequence[Rectangle], unit: str | None, frame: str, routes: Sequence[str] = ()
+    ) -> None:
+        # all at once, since compilers do not follow cached properties
+        least = {
+            route: [min(one.corner[axis] for one in rectangles if one.route == route) for axis in (0, 1)]
+            for route in {one.route for one in rectangles}
+        }
+        self.rectangles = tuple(
+            one._replace(corner=(one.corner[0] - top, one.corner[1] - left))
+            for one in rectangles
+            for top, left in [least[one.route]]
+        )
+        wide = any(one.columns > 1 for one in rectangles)
+        self.unit = ("px" if wide else "") if unit is None else unit
+        self.frame, self.routes = frame, (*routes,)
+        self.dimensions = 1 if not self.unit and not wide else 2
+        self.places = sum(one.places for one in rectangles)
+        self.count = 1 + max(one.route for one in rectangles)
+        self._corners, (self.rows, self.columns) = self._in_a_plane()
+        self._plain = self.dimensions == len(rectangles) == 1  # along which places are numbered
 
     @classmethod
-    def of(cls, parts: Sequence[Layout]) -> Layout:
-        """The area of several parts, whose corners may be negative; places of one part after those of the
-        other."""
-        top, left = (min(part.corner[axis] for part in parts) for axis in (0, 1))
-        frame = next((part.frame for part in parts if part.frame), "")
-        moved = [
-            part._replace(corner=(part.corner[0] - top, part.corner[1] - left), frame=frame) for part in parts
+    def of(
+        cls,
+        rectangles: Sequence[Rectangle],
+        unit: str | None = None,
+        frame: str = "",
+        routes: Sequence[str] = (),
+    ) -> Self:
+        """A layout of these rectangles, whose corners may be negative."""
+        layout = cls.__new__(cls)
+        layout._set(rectangles, unit, frame, routes)
+        return layout
+
+    @classmethod
+    def merged(cls, layouts: Sequence[Layout], names: Sequence[Sequence[str]]) -> Layout:
+        """Several layouts one after another, with the names of their routes."""
+        count = [*accumulate((one.count for one in layouts), initial=0)]
+        rectangles = [
+            part._replace(route=part.route + before)
+            for one, before in zip(layouts, count, strict=False)
+            for part in one.rectangles
         ]
-        if len(moved) == 1:
-            return moved[0]
-        rows = max(part.corner[0] + part.rows for part in moved)
-        columns = max(part.corner[1] + part.columns for part in moved)
-        return moved[0]._replace(rows=rows, columns=columns, corner=(0, 0), parts=(*moved,))
+        frame = next((one.frame for one in layouts if one.frame), "")
+        return Layout.of(rectangles, layouts[0].unit, frame, [name for own in names for name in own])
+
+    def _key(self) -> tuple[object, ...]:
+        return type(self), self.rectangles, self.unit, self.frame, self.routes
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Layout) and self._key() == other._key()
+
+    def __hash__(self) -> int:
+        return hash(self._key())
+
+    def __repr__(self) -> str:
+        sizes = " and ".join(f"{one.rows} x {one.columns}" for one in self.rectangles)
+        return f"{type(self).__name__}({sizes})"
+
+    # ------------------------------------------------------------------ what there is
 
     @property
-    def dimensions(self) -> int:
-        """1 of a route, along which places are numbered; else 2."""
-        return 1 if self.columns == 1 and not self.parts else 2
+    def area(self) -> Layout | None:
+        """Itself, if it is that of an area; None along routes."""
+        return self if self.dimensions == 2 else None
 
     @property
-    def rectangles(self) -> tuple[Layout, ...]:
-        """The parts, or itself."""
-        return self.parts or (self,)
+    def runs(self) -> tuple[Run, ...]:
+        """The runs of places of one route each, in the order of their numbers."""
+        found = []
+        for route, group in groupby(self.rectangles, lambda one: one.route):
+            parts = [*group]
+            frames = sum(one.places if one.frames is None else one.frames for one in parts)
+            found.append(Run(route, sum(one.places for one in parts), frames))
+        return (*found,)
+
+    def names(self, own: str) -> tuple[str, ...]:
+        """Of the routes; `own` of a single one without a name."""
+        return self.routes or (own,)
 
     @property
-    def places(self) -> int:
-        """N, the number of windows."""
-        return sum(part.rows * part.columns for part in self.rectangles)
+    def starts(self) -> tuple[int, ...]:
+        """The first place of each run."""
+        return (*accumulate((run.places for run in self.runs[:-1]), initial=0),)
+
+    def places_of(self, route: int) -> int:
+        """The number of places of a route."""
+        return sum(run.places for run in self.runs if run.route == route)
+
+    def route_of(self, places: Tensor) -> Tensor:
+        """The number of the route of each place, int64 of any shape; -1 stays."""
+        if self.count == 1:
+            return places.clamp(-1, 0)
+        ends = torch.tensor([run.places for run in self.runs], device=places.device).cumsum(0)
+        routes = torch.tensor([run.route for run in self.runs], device=places.device)
+        at = torch.searchsorted(ends, places.contiguous(), right=True)
+        return torch.where(places >= 0, routes[at.clamp(max=len(routes) - 1)], -1)
+
+    def told_routes(self, places: Tensor) -> Tensor | None:
+        """The number of the route of each place; None unless routes have names."""
+        return self.route_of(places) if self.routes else None
+
+    def reaching(self, places: int) -> Layout:
+        """Itself, or of a route whose length is not known one of so many places."""
+        return self if self.places else type(self)(places)
+
+    def sizes(self, chunk: int) -> list[Cell]:
+        """Rows and columns of each chunk: tiles of an area, up to `chunk` places of a route.
+
+        Example:
+            >>> Layout(25).sizes(10)
+            [(10, 1), (10, 1), (5, 1)]
+        """
+        if self.dimensions == 2:
+            return self.tiles
+        runs = (run.places for run in self.runs)
+        return [(min(chunk, n - start), 1) for n in runs for start in range(0, n, chunk)]
 
     @property
-    def fits(self) -> bool:
-        """Whether the parts lie within the bounds, and none on another."""
-        if not self.parts:
-            return True
-        used = torch.zeros(self.rows, self.columns, dtype=torch.bool)
-        for part in self.parts:
-            (top, left), rows, columns = part.corner, part.rows, part.columns
-            used[top : top + rows, left : left + columns] = True
-        return Layout.of(self.parts) == self and int(used.sum()) == self.places
-
-    @property
-    def north(self) -> float:
-        """Degrees clockwise from the upper side of the picture to north, where y grows (in pixels: falls)."""
-        (a, b), (c, d) = self.right, self.down
-        sign = (a * d - b * c) * (-1 if self.unit == "m" else 1)
-        return math.degrees(math.atan2(sign * c, sign * a))
-
-    @property
-    def tiles(self) -> list[tuple[int, int]]:
+    def tiles(self) -> list[Cell]:
         """Rows and columns of each tile."""
         return [(rows, columns) for rows, columns in _tables(self).size.tolist()]
 
     @property
-    def corners(self) -> list[tuple[int, int]]:
+    def corners(self) -> list[Cell]:
         """Row and column of the first window of each tile."""
         return [(row, column) for row, column in _tables(self).corner.tolist()]
 
+    def columns_from(self, place: int) -> int:
+        """The columns of the chunk that begins at a place."""
+        if self.dimensions == 1:
+            return 1
+        tables = _tables(self)
+        return int(tables.size[int((tables.start == place).nonzero()[0]), 1])
+
+    # ------------------------------------------------------------------ in rows and columns
+
+    def _in_a_plane(self) -> tuple[tuple[Cell, ...], Cell]:
+        """The corner of each rectangle in one plane, in which lattices are apart, and its extent."""
+        extents = []
+        for route in range(self.count):
+            own = [one for one in self.rectangles if one.route == route]
+            rows = max([0, *(one.corner[0] + one.rows for one in own)])
+            extents.append((rows, max([0, *(one.corner[1] + one.columns for one in own)])))
+
+        def along(down: int, across: int) -> tuple[tuple[Cell, ...], Cell]:
+            starts, top, left = list[Cell](), 0, 0
+            for rows, columns in extents:
+                starts.append((top, left))
+                top, left = top + down * (rows + GAP), left + across * (columns + GAP)
+            corners = (*(_sum(one.corner, starts[one.route]) for one in self.rectangles),)
+            ends = [_sum(start, size) for start, size in zip(starts, extents, strict=True)]
+            return corners, (max(row for row, _ in ends), max(column for _, column in ends))
+
+        ways = [along(1, 0), along(0, 1)][: self.dimensions]  # routes of one column follow each other
+        return min(ways, key=lambda way: math.prod(way[1]))
+
+    @property
+    def first(self) -> Point:
+        """(x, y) of the first row and column."""
+        one, (row, column) = self.rectangles[0], self._corners[0]
+        x, y = (one.first[i] - row * one.down[i] - column * one.right[i] for i in (0, 1))
+        return (x, y)
+
+    @property
+    def right(self) -> Point:
+        """(x, y) from a window to the next of its row."""
+        return self.rectangles[0].right
+
+    @property
+    def down(self) -> Point:
+        """(x, y) from a window to the next of its column."""
+        return self.rectangles[0].down
+
+    @property
+    def fits(self) -> bool:
+        """Whether no rectangle lies on another."""
+        if len(self.rectangles) == 1:
+            return True
+        used = torch.zeros(self.rows, self.columns, dtype=torch.bool)
+        for (top, left), one in zip(self._corners, self.rectangles, strict=True):
+            used[top : top + one.rows, left : left + one.columns] = True
+        return int(used.sum()) == self.places
+
+    @property
+    def extents(self) -> tuple[Cell, ...]:
+        """Rows and columns of each rectangle of an area; () along routes."""
+        return tuple((one.rows, one.columns) for one in self.rectangles if self.dimensions == 2)
+
+    def expect_tiles(self, tiles: Sequence[Cell]) -> None:
+        """Refuse rectangles that lie on each other, routes without names, and rows and columns of chunks, in
+        order, that are not those of an area."""
+        seen = "the map does not fit together"
+        expect(
+            self.fits, "one beside the other", f"{seen}: parts of an area that do not lie beside each other"
+        )
+        expect(all(self.routes), "different ones", f"{seen}: names {', '.join(self.routes)}")
+        wanted = f"those of {' and '.join(f'{rows} x {columns}' for rows, columns in self.extents)}"
+        fits = self.dimensions == 1 or [*tiles] == self.tiles[: len(tiles)]
+        expect(fits, wanted, f"{seen}: tiles {tiles!s:.100}")
+
     @property
     def inside(self) -> Tensor | None:
-        """Which rows and columns are windows, (R,C) float32; None if all are."""
-        order = self.orders()[0]
-        return (order < self.places).float().view(self.rows, self.columns) if self.parts else None
+        """Which rows and columns are places, (R,C) float32; None if all are."""
+        if len(self.rectangles) == 1:
+            return None
+        return (self._orders()[0] < self.places).float().view(self.rows, self.columns)
 
-    def orders(self) -> tuple[Tensor, Tensor]:
+    def _orders(self) -> tuple[Tensor, Tensor]:
         """The places row by row, (R C,), N where there is none, and the number of each place row by row,
         (N,), int64."""
         with torch.inference_mode(False):  # cached tensors are also used with gradients
             return _cached_orders(self, SIDE)
-
-    def columns_from(self, place: int) -> int:
-        """The columns of the tile that begins at a place."""
-        tables = _tables(self)
-        return int(tables.size[int((tables.start == place).nonzero()[0]), 1])
 
     def cells(self, places: Tensor) -> Tensor:
         """Row and column of places, int64 of any shape -> (..., 2)."""
@@ -160,15 +369,15 @@ class Layout(NamedTuple):
         return corner[tile] + torch.stack([inside // width, inside % width], -1)
 
     def place_at(self, cells: Tensor) -> Tensor:
-        """The places of rows and columns, (..., 2) -> (...); -1 where no window is."""
+        """The places of rows and columns, (..., 2) -> (...); -1 where none is."""
         row, column = cells[..., 0].clamp(0, self.rows - 1), cells[..., 1].clamp(0, self.columns - 1)
         found = self._numbered(row, column)
         return torch.where((cells[..., 0] == row) & (cells[..., 1] == column), found, -1)
 
     def _numbered(self, row: Tensor, column: Tensor) -> Tensor:
         """The places of rows and columns within the bounds, which may be broadcast; -1 for none."""
-        if self.parts:
-            found = self.orders()[0].to(row.device)[row * self.columns + column]
+        if len(self.rectangles) > 1:
+            found = self._orders()[0].to(row.device)[row * self.columns + column]
             return found.masked_fill(found == self.places, -1)
         down, across = (edges.to(row.device) for edges in _borders(self.rows, self.columns))
         at, beside = (
@@ -179,52 +388,78 @@ class Layout(NamedTuple):
         before = top * self.columns + (down[at + 1] - top) * left
         return before + (row - top) * (across[beside + 1] - left) + (column - left)
 
-    def coordinates(self, places: Tensor) -> Tensor:
-        """(x, y) of the middle of windows, int64 (...) -> (..., 2) float64."""
-        cells = self.cells(places)
-        found = torch.zeros(cells.shape, dtype=torch.float64, device=places.device)
-        before = 0
-        for part in self.rectangles:
-            own = ((places >= before) & (places < before + part.places))[..., None]
-            before += part.places
-            steps = found.new_tensor([part.down, part.right])
-            at = (cells - cells.new_tensor(part.corner)).double() @ steps + found.new_tensor(part.first)
-            found = torch.where(own, at, found)
-        return found
+    def as_plane(self, values: Tensor) -> Tensor:
+        """Values by place, (T,N) -> (T,R,C), 0 where there is none."""
+        order = self._orders()[0].to(values.device)
+        values = F.pad(values, (0, 1)) if len(self.rectangles) > 1 else values
+        return values.index_select(1, order).view(len(values), self.rows, self.columns)
 
-    def place_near(self, points: Tensor) -> Tensor:
-        """The places whose middles are nearest to (x, y), (n,2) -> (n,); -1 for over half a step away."""
-        found, before = torch.full((len(points),), -1), 0
-        for part in self.rectangles:
-            first, *steps = torch.tensor([part.first, part.down, part.right], dtype=torch.float64)
-            cells = (points.double() - first) @ torch.stack(steps).inverse()
-            place = part._replace(corner=(0, 0)).place_at(cells.nan_to_num(-1).round().long())
-            found = torch.where(place >= 0, before + place, found)
-            before += part.places
-        return found
+    def by_place(self, plane: Tensor) -> Tensor:
+        """Values of a plane by place, (T,R,C) -> (T,N)."""
+        return plane.flatten(1).index_select(1, self._orders()[1].to(plane.device))
+
+    # ------------------------------------------------------------------ which are near
 
     def distance(self, one: Tensor, other: Tensor) -> Tensor:
-        """The larger of the distances in rows and columns, int64."""
-        if self.dimensions == 1:
+        """The larger of the distances in rows and columns, int64; `FAR` and more on another route."""
+        if self._plain:
             return (one - other).abs()
-        return (self.cells(one) - self.cells(other)).abs().amax(-1)
+        apart = (self.cells(one) - self.cells(other)).abs().amax(-1)
+        return apart + FAR * (self.route_of(one) != self.route_of(other))
 
     def near(self, radius: int) -> int:
         """How many places are at most so far from one of them."""
-        side = 2 * radius + 1
-        return side if self.dimensions == 1 else side * side
+        side: int = (2 * radius + 1) ** self.dimensions
+        return side
 
     def around(self, places: Tensor, radius: int) -> Tensor:
         """The places up to a radius in rows and columns, (n,) -> (n, `near`) or fewer; those beyond a border
         are others of them."""
+        near = self.neighbours(places, radius)
+        return torch.where(near < 0, places[:, None], near)
+
+    def neighbours(self, places: Tensor, radius: int) -> Tensor:
+        """As `around`, -1 beyond a border."""
         radius = min(radius, max(self.rows, self.columns))
         offset = torch.arange(-radius, radius + 1, device=places.device)
-        if self.dimensions == 1:
-            return (places[:, None] + offset).clamp(0, self.rows - 1)
-        row, column = (self.cells(places)[:, None] + offset[:, None]).unbind(-1)
-        row, column = row.clamp(0, self.rows - 1), column.clamp(0, self.columns - 1)
-        near = self._numbered(row[:, :, None], column[:, None]).flatten(1)
-        return torch.where(near < 0, places[:, None], near) if self.parts else near
+        if self._plain:
+            near = places[:, None] + offset
+            return near.masked_fill((near < 0) | (near >= self.places), -1)
+        row, column = self.cells(places)[..., None].unbind(1)
+        across = {1: offset[:1] * 0, 2: offset}[self.dimensions]
+        row, column = row + offset, column + across
+        at = row.clamp(0, self.rows - 1)[:, :, None], column.clamp(0, self.columns - 1)[:, None]
+        inside = (at[0] == row[:, :, None]) & (at[1] == column[:, None])
+        near = self._numbered(*at).masked_fill(~inside, -1).flatten(1)
+        if self.count > 1:
+            near = near.masked_fill(self.route_of(near) != self.route_of(places)[:, None], -1)
+        return near
+
+    def mass_near(self, mass: Tensor, places: Tensor, radius: int) -> Tensor:
+        """The mass of places (Q,) and of those up to a radius, (Q,N) -> (Q,)."""
+        if self.dimensions == 2:
+            sums = self.by_place(boxes(self.as_plane(mass), radius)).clamp(0, 1)
+            return sums.gather(1, places[:, None])[:, 0]
+        near = self.neighbours(places, min(radius, self.places))
+        return (mass.gather(1, near.clamp(min=0)) * (near >= 0)).sum(1).clamp(0, 1)
+
+    def blurred(self, mass: Tensor, radius: int) -> Tensor:
+        """The mass of each place and those up to a radius, with weights that fall with the distance: a
+        triangle along a route, a pyramid over an area, (Q,N) -> (Q,N)."""
+        if not radius:
+            return mass
+        if self.dimensions == 2:
+            half = max(1, radius // 2)  # two boxes make a pyramid, whole also at a border
+            padded = F.pad(self.as_plane(mass), 4 * (half,))
+            pyramid = boxes(boxes(padded, half), half)[:, half:-half, half:-half]
+            return self.by_place(pyramid / (2 * half + 1) ** 2).clamp(0, 1)
+        if self._plain:
+            return triangles(mass, radius)
+        order = self._orders()[0].to(mass.device)
+        order = order[order < self.places]  # route after route
+        sizes = [self.places_of(route) for route in range(self.count)]
+        parts = [triangles(part, radius) for part in mass[:, order].split(sizes, 1)]
+        return torch.cat(parts, 1)[:, order.argsort()]
 
     def strided(self, k: int) -> tuple[Tensor, Tensor]:
         """Every k-th place in each direction, (n,), and of each place which of these is nearest, (N,), int64.
@@ -233,6 +468,14 @@ class Layout(NamedTuple):
             >>> [table.tolist() for table in Layout(6).strided(3)]
             [[0, 3], [0, 0, 1, 1, 1, 1]]
         """
+        if len(self.rectangles) > 1:
+            kept, nearest, count = list[Tensor](), list[Tensor](), 0
+            for one, start in zip(self.rectangles, self._firsts, strict=True):
+                stored, near = Layout.of([one]).strided(k)
+                kept.append(stored + start)
+                nearest.append(near + count)
+                count += len(stored)
+            return torch.cat(kept), torch.cat(nearest)
 
         def along(count: int) -> tuple[Tensor, Tensor]:
             stored = torch.arange(0, count, k)
@@ -243,40 +486,339 @@ class Layout(NamedTuple):
         stored = self.place_at(torch.cartesian_prod(rows, columns).view(-1, 2))
         return stored, above[row] * len(columns) + beside[column]
 
-    def between(self, start: int, stop: int) -> Layout:
-        """The area of some of the parts: those of the places [start, stop)."""
-        first = accumulate((part.places for part in self.rectangles), initial=0)
-        parts = zip(self.rectangles, first, strict=False)
-        return Layout.of([part for part, at in parts if start <= at < stop])
+    def passed_again(self, places: Tensor, apart: int) -> Tensor:
+        """The places about so many before and after each, (n,) -> (n,M), with the ends of a route beside each
+        other, as it may end where it begins; of an area as many around."""
+        if self.dimensions == 2:
+            return self.around(places, round(apart**0.5))
+        near = places[:, None] + torch.arange(-apart, apart + 1, device=places.device)
+        return near.remainder(self.places)
+
+    # ------------------------------------------------------------------ where a camera can go
+
+    @property
+    def joins(self) -> tuple[Link, ...]:
+        """The steps from one rectangle of a route to the next."""
+        parts = sorted(
+            (one.route, one.corner[0], start, start + one.places - 1)
+            for one, start in zip(self.rectangles, self._firsts, strict=True)
+            if self.dimensions == 1
+        )
+        return tuple(
+            (last, first, 1.0)
+            for (route, _, _, last), (other, _, first, _) in pairwise(parts)
+            if route == other
+        )
+
+    def states(self, directions: int = 1, links: Sequence[Link] = (), turn: float = 0.0) -> States:
+        """The states of a camera that goes along routes, by further links too."""
+        return States(self.places, directions, self.starts, (*links, *self.joins), turn)
+
+    # ------------------------------------------------------------------ on the ground
+
+    @property
+    def _firsts(self) -> list[int]:
+        """The first place of each rectangle."""
+        return [*accumulate((one.places for one in self.rectangles), initial=0)][:-1]
+
+    def coordinates(self, places: Tensor) -> Tensor:
+        """(x, y) of the middle of windows, int64 (...) -> (..., 2) float64; NaN along a route, and of -1."""
+        found = torch.full((*places.shape, 2), math.nan, dtype=torch.float64, device=places.device)
+        if self.dimensions == 1:
+            return found
+        cells = self.cells(places.clamp(min=0))
+        for one, corner, start in zip(self.rectangles, self._corners, self._firsts, strict=True):
+            own = ((places >= start) & (places < start + one.places))[..., None]
+            steps = found.new_tensor([one.down, one.right])
+            at = (cells - cells.new_tensor(corner)).double() @ steps + found.new_tensor(one.first)
+            found = torch.where(own, at, found)
+        return found
+
+    def place_near(self, points: Tensor) -> Tensor:
+        """The places whose middles are nearest to (x, y), (n,2) -> (n,); -1 for over half a step away."""
+        found = torch.full((len(points),), -1)
+        for one, start, cells in self._among(points):
+            place = Layout.of([one]).place_at(cells.nan_to_num(-1).round().long())
+            found = torch.where(place >= 0, start + place, found)
+        return found
+
+    def _among(self, points: Tensor) -> list[tuple[Rectangle, int, Tensor]]:
+        """Each rectangle, its first place, and the rows and columns of points (n,2) in it, (n,2) float64."""
+        each = []
+        for one, start in zip(self.rectangles, self._firsts, strict=True):
+            first, *steps = torch.tensor([one.first, one.down, one.right], dtype=torch.float64)
+            each.append((one, start, (points.double() - first) @ torch.stack(steps).inverse()))
+        return each if self.dimensions == 2 else []
+
+    def within(self, points: Tensor, distance: float) -> Tensor:
+        """The windows whose middles are at most so far from (x, y), (n,2) -> (n,M) int64, -1 as padding."""
+        found = [torch.full((len(points), 1), -1)]
+        for one, start, cells in self._among(points):
+            alone = Layout.of([one])
+            last = cells.new_tensor([one.rows - 1, one.columns - 1])
+            nearest = cells.nan_to_num(-1).clamp(torch.zeros_like(last), last).round().long()
+            reach = 1 + math.ceil(distance / min(math.hypot(*one.down), math.hypot(*one.right)))
+            near = alone.neighbours(alone.place_at(nearest), reach)
+            away = (alone.coordinates(near) - points.double()[:, None]).norm(dim=2)
+            found.append(torch.where(away <= distance, start + near, -1))
+        table = torch.cat(found, 1).sort(1, descending=True).values
+        return table[:, : max(1, int((table >= 0).sum(1).max()))] if len(table) else table
+
+    @property
+    def spacing(self) -> float:
+        """The distance from a place to the next, in the unit of coordinates; 1 along a route."""
+        return math.hypot(*self.right)
+
+    @property
+    def has_north(self) -> bool:
+        """Whether its windows look in a known direction, as those over the ground do."""
+        return self.dimensions == 2
+
+    @property
+    def north(self) -> float:
+        """Degrees clockwise from the upper side of the picture to north, where y grows (in pixels: falls)."""
+        (a, b), (c, d) = self.right, self.down
+        sign = (a * d - b * c) * (-1 if self.unit == "m" else 1)
+        return math.degrees(math.atan2(sign * c, sign * a))
+
+    def reach(self, tolerance: int, distance: float | None = None) -> Reach:
+        """Within how many places an answer is right: the tolerance along a route; over an area, whose numbers
+        of places tell no distance, those within a distance, by default the tolerance."""
+        if self.dimensions == 1:
+            return Reach(tolerance, tolerance, float(tolerance))
+        radius = float(tolerance) if distance is None else distance
+        return Reach(0, round(radius / self.spacing), radius)
+
+    # ------------------------------------------------------------------ in words
+
+    @property
+    def kind(self) -> str:
+        """What it is of: "a route" or "an area"."""
+        return ("a route", "an area")[self.dimensions - 1]
+
+    @property
+    def noun(self) -> str:
+        """What a place is: "frame" or "window"."""
+        return ("frame", "window")[self.dimensions - 1]
+
+    @property
+    def units(self) -> str:
+        """Of its coordinates: "metres" or "pixels"; "" along a route."""
+        return {"": "", "m": "metres"}.get(self.unit, "pixels")
+
+    @property
+    def extent(self) -> dict[str, Any]:
+        """Rows and columns of an area, as reports have them; {} along a route."""
+        return {"area": {"rows": self.rows, "columns": self.columns}} if self.dimensions == 2 else {}
+
+    def radii(self, counts: Sequence[int]) -> list[float]:
+        """So many metres, or windows in pixels; none along a route."""
+        each = {"": [], "m": [1.0]}.get(self.unit, [self.spacing])
+        return [one * count for one in each for count in counts]
+
+    @property
+    def axes(self) -> tuple[str, ...]:
+        """Names of its coordinates; none along a route."""
+        return ("x", "y")[: 2 * (self.dimensions - 1)]
+
+    @property
+    def system(self) -> str:
+        """What its coordinates count from, or their unit."""
+        return self.frame or self.unit
+
+    def truth(self, distance: float) -> str | None:
+        """The ground truth by coordinates within a distance, see `find_ground_truth`; None along a route."""
+        return None if self.dimensions == 1 else f"{self.units}:{distance:g}"
+
+    def expect_route(self, to_be: str, seen: str) -> None:
+        """Refuse an area."""
+        expect(self.dimensions == 1, to_be, seen)
+
+    def expect_area(self, to_be: str, seen: str) -> None:
+        """Refuse a route."""
+        expect(self.dimensions == 2, to_be, seen)
+
+    def expect_one(self, to_be: str, seen: str = "the map has the routes {}") -> None:
+        """Refuse several routes, whose names are put in what is `seen`."""
+        expect(self.count == 1 and not self.routes, to_be, seen.format(", ".join(self.routes)))
+
+    def expect_several(self, to_be: str, seen: str) -> None:
+        """Refuse a single route without a name."""
+        expect(self.routes, to_be, seen)
+
+    def expect_unit(self, unit: str, seen: str) -> None:
+        """Refuse distances in pixels over an area in metres, and the reverse."""
+        expect(
+            self.dimensions == 1 or unit == self.unit,
+            "the same unit",
+            f"{seen}, and coordinates of the area in {self.system}",
+        )
+
+    def same(self, other: Layout) -> bool:
+        """Whether the places of another are numbered alike and, if both know their frames, lie where these
+        do; of routes, whether it is one too."""
+        if self.dimensions == other.dimensions == 1:
+            return True
+        known = bool(self.frame and other.frame)
+        mine, yours = (
+            [(one.corner, one.rows, one.columns, known and one[2:5]) for one in layout.rectangles]
+            for layout in (self, other)
+        )
+        return mine == yours and (not known or self.system == other.system)
+
+    def unlike(self, other: Layout) -> str:
+        """Why places of another cannot be in one map with these; "" if they can."""
+        if self.dimensions != other.dimensions:
+            return f"{other.kind} and {self.kind}"
+        if self.dimensions == 1:
+            return ""
+        if self.unit != other.unit or not agree(self.frame, other.frame):
+            return f"coordinates are in {self.system} and {other.system}"
+        for way in ("right", "down"):
+            mine, yours = (math.hypot(*getattr(layout, way)) for layout in (self, other))
+            if abs(mine - yours) > STRIDE * mine:
+                return f"windows are {mine:g} and {yours:g} {self.unit} apart"
+        if abs((self.north - other.north + 180) % 360 - 180) > NORTH:
+            return f"north is {self.north:g} and {other.north:g} degrees from up"
+        return ""
+
+    # ------------------------------------------------------------------ edits
+
+    def number(self, route: str) -> int:
+        """The number of a route; an InputError if there is none of this name."""
+        expect(route in self.routes, f"one of {', '.join(self.routes)}", f"there is no route {route!r}")
+        return self.routes.index(route)
+
+    def showing(self, frames: int) -> Layout:
+        """A route that knows how many frames it shows; several do."""
+        if len(self.rectangles) > 1:
+            return self
+        return type(self).of([self.rectangles[0]._replace(frames=frames)], self.unit, self.frame, self.routes)
+
+    def only(self, route: int) -> Layout:
+        """That of one route."""
+        parts = [one._replace(route=0, frames=None) for one in self.rectangles if one.route == route]
+        if self.dimensions == 1:
+            parts = [parts[0]._replace(rows=sum(one.rows for one in parts), corner=(0, 0))]
+        return type(self).of(parts, self.unit, self.frame)
+
+    def ranges(self, route: int) -> list[range]:
+        """The runs of places of a route."""
+        runs = zip(self.runs, self.starts, strict=True)
+        return [range(start, start + run.places) for run, start in runs if run.route == route]
+
+    def places_in(self, route: int) -> Tensor:
+        """The places of a route, in its order, int64."""
+        parts = zip(self.rectangles, self._firsts, strict=True)
+        return torch.cat(
+            [torch.arange(start, start + one.places) for one, start in parts if one.route == route]
+        )
+
+    def cut(self, start: int, stop: int) -> Layout:
+        """That of consecutive places along routes."""
+        parts = [
+            one._replace(rows=rows, frames=None)
+            for one, first in zip(self.rectangles, self._firsts, strict=True)
+            if (rows := min(stop, first + one.rows) - max(start, first)) > 0
+        ]
+        numbers = sorted({one.route for one in parts})
+        parts = [one._replace(route=numbers.index(one.route)) for one in parts]
+        return Layout.of(parts, "", "", [self.routes[r] for r in numbers] if self.routes else ())
+
+    def grown(self, other: Layout, name: str, frames: int | None = None, route: int = 0) -> Layout:
+        """That of these places and more of a route: behind its last, or windows where their coordinates put
+        them.
+
+        Args:
+            other: of a traverse. name: of it, for messages. frames: see `Rectangle`. route: its number.
+
+        Raises:
+            InputError: a route and an area, other distances between windows, windows of both at one place,
+                or areas far apart.
+        """
+        seen = f"{name} is {other.kind}, the map is of {self.kind}"
+        expect(self.dimensions == other.dimensions, "a route for a route, an area for an area", seen)
+        seen = self.unlike(other)
+        expect(not seen, "the same", f"{name} does not continue the map: {seen}")
+        own, last = [one for one in self.rectangles if one.route == route], self.rectangles[-1]
+        if self.dimensions == 2:
+            added = self._beside(own, other, name)._replace(route=route)
+        elif last.route == route:  # its chunks follow
+            rows, shown = last.rows + other.places, (last.frames or last.rows) + (frames or other.places)
+            longer = last._replace(rows=rows, frames=None if shown == rows else shown)
+            return type(self).of([*self.rectangles[:-1], longer], self.unit, self.frame, self.routes)
+        else:
+            end = max(one.corner[0] + one.rows for one in own)
+            added = Rectangle(other.places, corner=(end, 0), route=route, frames=frames)
+        return type(self).of([*self.rectangles, added], self.unit, self.frame or other.frame, self.routes)
+
+    def _beside(self, own: Sequence[Rectangle], other: Layout, name: str) -> Rectangle:
+        """More windows in the lattice of some rectangles."""
+        one, (added,) = own[0], other.rectangles
+        steps, ends = (
+            torch.tensor(pair, dtype=torch.float64)
+            for pair in ((one.down, one.right), (one.first, added.first))
+        )
+        away = torch.linalg.solve(steps.T, ends[1] - ends[0]).round().long()
+        row, column = (away + torch.tensor(one.corner)).tolist()
+        for (top, left), rows, columns in ((part.corner, part.rows, part.columns) for part in own):
+            tall = min(row + added.rows, top + rows) - max(row, top)
+            wide = min(column + added.columns, left + columns) - max(column, left)
+            seen = f"{name} and the map share {tall} x {wide} windows"
+            expect(min(tall, wide) <= 0, "ground that the map lacks", seen)
+        added = added._replace(corner=(row, column))
+        joined = Layout.of([*(part._replace(route=0) for part in own), added])
+        seen = f"{name} and the map lie in {joined.rows} x {joined.columns} windows, of which they have few"
+        expect(joined.rows * joined.columns <= SPARSE * joined.places, "areas nearby, or maps to merge", seen)
+        return added
+
+    # ------------------------------------------------------------------ in a file
+
+    def stored(self) -> dict[str, Any]:
+        """What a map file keeps, beside the number of places, as JSON values."""
+        facts, names = dict[str, Any](), self.routes
+        if names or self.dimensions == 2:
+            routes = ({"name": names[r], "places": n, "frames": f} for r, n, f in self.runs if names)
+            facts["routes"] = [*routes]
+        if self.dimensions == 2:
+            parts = [
+                {name: getattr(one, name) for name in ("rows", "columns", "first", "right", "down")}
+                | {"unit": self.unit, "frame": self.frame, "corner": corner}
+                for one, corner in zip(self.rectangles, self._corners, strict=True)
+            ]
+            area = parts[0] | {"rows": self.rows, "columns": self.columns}
+            del area["corner"]
+            facts["area"] = area | ({"parts": parts} if len(parts) > 1 else {})
+        return facts if type(self) is Layout else facts | {"layout": type(self).__name__}
+
+    @staticmethod
+    def restored(facts: Mapping[str, Any], places: int) -> Layout:
+        """The layout of so many places from the results of `stored`."""
+        kind, area = KINDS[facts.get("layout", "Layout")], facts.get("area")
+        named = [(run["name"], run["places"], run["frames"]) for run in facts.get("routes", ())]
+        if area is None and not named:
+            return ROUTE if kind is Layout else kind(places)
+        names = [*dict.fromkeys(name for name, _, _ in named)]
+        runs = [(names.index(name), n, f) for name, n, f in named]
+        if area is None:
+            rectangles, ends = [], [0] * len(names)
+            for route, n, f in runs:
+                corner = ends[route], 0
+                rectangles.append(Rectangle(n, corner=corner, route=route, frames=None if f == n else f))
+                ends[route] += n
+            return kind.of(rectangles, "", "", names)
+        rectangles, owners = [], iter([r for r, n, _ in runs for _ in range(n)])
+        for part in area.get("parts", [area]):
+            first, right, down = (_pair(part[name]) for name in ("first", "right", "down"))
+            top, left = part.get("corner", (0, 0))
+            one = Rectangle(part["rows"], part["columns"], first, right, down, (top, left), next(owners, 0))
+            rectangles.append(one)
+            next(islice(owners, one.places - 1, one.places - 1), None)
+        return kind.of(rectangles, area["unit"], area["frame"], names)
 
 
-def apart(areas: Sequence[Layout]) -> Layout:
-    """The area of several that are not of one ground: none of their windows are near those of another."""
-
-    def along(down: int, across: int) -> Layout:
-        parts, top, left = list[Layout](), 0, 0
-        for area in areas:
-            for part in area.rectangles:
-                parts.append(part._replace(corner=(top + part.corner[0], left + part.corner[1])))
-            top, left = top + down * (area.rows + GAP), left + across * (area.columns + GAP)
-        return Layout.of(parts)
-
-    return min(along(1, 0), along(0, 1), key=lambda area: area.rows * area.columns)
-
-
-def area_of(stored: Mapping[str, Any]) -> Layout:
-    """An area from the values of `stored_area`, as JSON keeps them."""
-    points: dict[str, Any] = {name: tuple(stored[name]) for name in ("first", "right", "down")}
-    corner, parts = tuple(stored.get("corner", (0, 0))), tuple(map(area_of, stored.get("parts", ())))
-    return Layout(**{**stored, **points, "corner": corner, "parts": parts})
-
-
-def stored_area(area: Layout) -> dict[str, Any]:
-    """An area as JSON keeps it; parts only where there are several."""
-    stored = area._asdict()
-    parts = [stored_area(part) | {"corner": part.corner} for part in stored.pop("parts")]
-    del stored["corner"]
-    return stored | {"parts": parts} if parts else stored
+KINDS: dict[str, type[Layout]] = {"Layout": Layout}  # that a map file may name
+ROUTE = Layout()  # a route whose length is not yet known, see `Layout.reaching`
 
 
 def agree(one: str, other: str) -> bool:
@@ -284,30 +826,51 @@ def agree(one: str, other: str) -> bool:
     return "" in (one, other) or one == other
 
 
-def same_windows(one: Layout | None, other: Layout | None) -> bool:
-    """Whether two areas number their places alike and, if both know their frames, these lie where the other's
-    do; also two routes."""
-    if one is None or other is None:
-        return one is other
-    known = bool(one.frame and other.frame)
-    mine, yours = (
-        [(part.corner, part.rows, part.columns, known and part[2:7]) for part in area.rectangles]
-        for area in (one, other)
-    )
-    return mine == yours
+def boxes(mass: Tensor, radius: int) -> Tensor:
+    """Sums over squares of 2 radius + 1 windows to a side, (T,R,C) -> (T,R,C)."""
+    side = 2 * radius + 1
+    sums: Tensor = F.avg_pool2d(mass[:, None], side, 1, radius, divisor_override=1)[:, 0]
+    return sums
 
 
-def _tables(area: Layout) -> Tables:
+def triangles(mass: Tensor, radius: int) -> Tensor:
+    """Sums with weights of a triangle that ends at a radius, (Q,N) -> (Q,N): two box filters."""
+    radius = min(radius, mass.shape[1])
+    return window_sums(window_sums(F.pad(mass, (radius, radius)), radius + 1), radius + 1) / (radius + 1)
+
+
+def window_sums(values: Tensor, width: int) -> Tensor:
+    """Sums of `width` neighbours, (..., N + width - 1) -> (..., N).
+
+    Example:
+        >>> window_sums(torch.tensor([1.0, 2, 3, 4]), 3)
+        tensor([6., 9.])
+    """
+    count, size, at, total = values.shape[-1] - width + 1, 1, 0, torch.zeros(())
+    while True:  # sums of 1, 2, 4, .. neighbours, which is several times as fast as pooling
+        if width & size:
+            total, at = total + values.narrow(-1, at, count), at + size
+        if (size := 2 * size) > width:
+            return total
+        values = values[..., : -(size // 2)] + values[..., size // 2 :]
+
+
+def _pair(values: Sequence[float]) -> Point:
+    x, y = values
+    return x, y
+
+
+def _tables(layout: Layout) -> Tables:
     with torch.inference_mode(False):  # cached tensors are also used with gradients
-        return _cached_tables(area, SIDE)
+        return _cached_tables(layout, SIDE)
 
 
 @lru_cache(16)
-def _cached_tables(area: Layout, side: int) -> Tables:
+def _cached_tables(layout: Layout, side: int) -> Tables:
     corners, sizes = list[Tensor](), list[Tensor]()
-    for part in area.rectangles:
+    for part, corner in zip(layout.rectangles, layout._corners, strict=True):
         down, across = _borders(part.rows, part.columns)
-        corners.append(torch.cartesian_prod(down[:-1], across[:-1]).view(-1, 2) + torch.tensor(part.corner))
+        corners.append(torch.cartesian_prod(down[:-1], across[:-1]).view(-1, 2) + torch.tensor(corner))
         sizes.append(torch.cartesian_prod(down.diff(), across.diff()).view(-1, 2))
     size = torch.cat(sizes)
     return Tables(torch.cat(corners), size, torch.cat([size.new_zeros(1), size.prod(1).cumsum(0)[:-1]]))
@@ -326,11 +889,11 @@ def _cached_borders(rows: int, columns: int, side: int) -> tuple[Tensor, Tensor]
 
 
 @lru_cache(2)  # of 16 bytes a window
-def _cached_orders(area: Layout, side: int) -> tuple[Tensor, Tensor]:
-    cells = area.cells(torch.arange(area.places))
-    rank = cells[:, 0] * area.columns + cells[:, 1]
-    order = torch.full((area.rows * area.columns,), area.places)
-    order[rank] = torch.arange(area.places)
+def _cached_orders(layout: Layout, side: int) -> tuple[Tensor, Tensor]:
+    cells = layout.cells(torch.arange(layout.places))
+    rank = cells[:, 0] * layout.columns + cells[:, 1]
+    order = torch.full((layout.rows * layout.columns,), layout.places)
+    order[rank] = torch.arange(layout.places)
     return order, rank
 
 

@@ -10,9 +10,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from dejavu_torch.area import Area
 from dejavu_torch.maps.place_map import PlaceMap
-from dejavu_torch.places.layout import Layout
+from dejavu_torch.places.layout import ROUTE, Layout
 from dejavu_torch.recognition.filter import PlaceFilter, moments_of
 from dejavu_torch.recognition.select import best_candidates, best_match
 from dejavu_torch.recognition.smoother import Drive, PlaceSmoother
@@ -143,15 +142,15 @@ def look_alikes(platt: Platt, right: Tensor, own: Tensor, others: Tensor) -> Pla
 
 
 def best_pair(
-    scores: Tensor, area: Area | None = None, places: Tensor | None = None, apart: int = TOLERANCE
+    scores: Tensor, layout: Layout = ROUTE, places: Tensor | None = None, apart: int = TOLERANCE
 ) -> Match:
     """The two best places of each query that are more than `TOLERANCE` apart, or more, (Q,N) -> (Q,2)."""
-    return best_candidates(scores, min(2, scores.shape[1]), max(TOLERANCE, apart), places, area)
+    return best_candidates(scores, min(2, scores.shape[1]), max(TOLERANCE, apart), places, layout)
 
 
-def confidence_of(scores: Tensor, area: Area | None = None, margin: float | None = None) -> Tensor:
+def confidence_of(scores: Tensor, layout: Layout = ROUTE, margin: float | None = None) -> Tensor:
     """`confidence` in the best place of each query, (Q,N) -> (Q,)."""
-    return confidence(best_pair(scores, area), margin)
+    return confidence(best_pair(scores, layout), margin)
 
 
 def confidence(pair: Match, margin: float | None = None) -> Tensor:
@@ -176,15 +175,15 @@ class Track:
     queries stand out at these places. The posterior alone is overconfident off the map, where it follows the
     best of the wrong places."""
 
-    def __init__(self, area: Area | None = None) -> None:
-        self.area, self.sum, self.weight = area, 0.0, 0.0
+    def __init__(self, layout: Layout = ROUTE) -> None:
+        self.layout, self.sum, self.weight = layout, 0.0, 0.0
 
     def __call__(self, filtered: Tensor, scores: Tensor) -> Tensor:
         """The filter's scores and those of single queries, each (B,N) -> (B,) float64 on the CPU."""
         match = best_match(filtered)
         mean, spread, *_ = moments_of(scores)
-        own = scores.gather(1, _window(match.index, ANSWER_RADIUS, scores, self.area)).amin(1)
-        rival = scores.scatter(1, _window(match.index, TOLERANCE, scores, self.area), math.inf).amin(1)
+        own = scores.gather(1, _window(match.index, ANSWER_RADIUS, scores, self.layout)).amin(1)
+        rival = scores.scatter(1, _window(match.index, TOLERANCE, scores, self.layout), math.inf).amin(1)
         margin = torch.where(rival.isfinite(), rival - own, 0)
         deviations = torch.where(own.isfinite(), (mean[:, 0] - own + MARGIN * margin) / spread[:, 0], 0)
         means = []
@@ -197,9 +196,9 @@ class Track:
         return torch.where(score.isfinite(), odds + NATS_PER_DEVIATION * odds.new_tensor(means), -math.inf)
 
 
-def _window(index: Tensor, radius: int, scores: Tensor, area: Area | None = None) -> Tensor:
+def _window(index: Tensor, radius: int, scores: Tensor, layout: Layout = ROUTE) -> Tensor:
     """The places within a radius of each index, (B,) -> (B,n), clamped to the map."""
-    return (area or Layout(scores.shape[1])).around(index.clamp(min=0), radius)
+    return layout.reaching(scores.shape[1]).around(index.clamp(min=0), radius)
 
 
 @torch.no_grad()
@@ -221,18 +220,18 @@ def calibrated(
             the probability of single queries, see `look_alikes`.
         reach: places within which an answer is right.
     """
-    area, around_own = place_map.area, min(2 * max(reach, TOLERANCE), place_map.places)
+    layout, around_own = place_map.layout, min(2 * max(reach, TOLERANCE), place_map.places)
     answers: tuple[list[tuple[Tensor, ...]], ...] = [], []  # of single queries, of a filter
     for descriptors, places in segments:
         scores = torch.cat([place_map.scores(part) for part in descriptors.split(64)])
         places = places.to(scores.device)
-        off_map = scores.scatter(1, _window(places, around_own, scores, area), math.inf)
+        off_map = scores.scatter(1, _window(places, around_own, scores, layout), math.inf)
         for single, on_map in ((scores, True), (off_map, False)):
-            filtered = PlaceFilter(within=reach).over(area)(single)
-            pairs = (single, confidence_of(single, area)), (filtered, Track(area)(filtered, single))
+            filtered = PlaceFilter(within=reach).over(layout)(single)
+            pairs = (single, confidence_of(single, layout)), (filtered, Track(layout)(filtered, single))
             for rows, (scored, confidences) in zip(answers, pairs, strict=True):
                 index = best_match(scored).index
-                near = place_map.layout.distance(index.clamp(min=0), places.clamp(min=0)) <= reach
+                near = layout.distance(index.clamp(min=0), places.clamp(min=0)) <= reach
                 right = near & (index >= 0) & (places >= 0) & on_map
                 columns = confidences, right, torch.full_like(right, on_map)
                 rows.append(tuple(column.cpu()[places.cpu() >= 0] for column in columns))
@@ -248,12 +247,8 @@ def calibrated(
             known = torch.where(right, confidences, -math.inf)[on_the_map]
             scores = torch.cat([place_map.scores(part) for part in own[0].split(64)])
             places, apart = own[1].to(scores.device), min(STRETCH, place_map.places // 4)
-            if area is None:
-                near = places[:, None] + torch.arange(-apart, apart + 1, device=scores.device)
-                near = near.remainder(place_map.places)  # a route may end where it begins
-            else:
-                near = area.around(places, round(apart**0.5))
-            pair = (confidence_of(one, area).cpu() for one in (scores, scores.scatter(1, near, math.inf)))
+            near = layout.passed_again(places, apart)
+            pair = (confidence_of(one, layout).cpu() for one in (scores, scores.scatter(1, near, math.inf)))
             platts[0] = look_alikes(platts[0], known, *pair)
     return Calibration(*platts)
 

@@ -99,7 +99,7 @@ def plan(place_map: PlaceMap, limit: int | None = None) -> SamplingPlan | None:
             limit = torch.cuda.mem_get_info(device)[0] // FREE
 
     def size(places: int, *spacings: int) -> int:
-        each = {d: d if place_map.area is None else d * d for d in spacings}  # of an area in both directions
+        each = {d: d**place_map.layout.dimensions for d in spacings}
         return sum(-(-places // n) * (width * (2 if d == 1 else 1) + OVERHEAD) for d, n in each.items())
 
     every = SamplingPlan(1, 1, 0, 1.0, size(place_map.places, 1))
@@ -119,7 +119,7 @@ def plan(place_map: PlaceMap, limit: int | None = None) -> SamplingPlan | None:
     widest_fine = next((d for d in SPACINGS if held[d] >= FINE), 2)
     for coarse in [d for d in SPACINGS[::-1] if d >= max(4, widest_coarse)] if widest_coarse else ():
         spacings = [d for d in SPACINGS[::-1] if min(widest_fine, coarse // 2) <= d <= coarse // 2]
-        spacings = spacings if place_map.area is None else []
+        spacings = {1: spacings, 2: []}[place_map.layout.dimensions]
         for fine in [1, *spacings] if fits else spacings:
             if size(place_map.places, coarse, fine) <= limit:
                 refined = REFINED * (1 if coarse == widest_coarse else 4)
@@ -195,19 +195,25 @@ class CoarseSearch(Scan):
     def _windows(self, units: Tensor, best: Tensor, wanted: list[NmsSpec]) -> Tensor:
         """Places near the best fine samples of each query, (Q,M), by place; -1 for none. A window is wide
         enough for all candidates on one peak."""
-        plan, places = self.plan, self.place_map.places
         count = max(k for k, _ in wanted)
-        group, best = topk_groups(best, max(plan.refined, 2 * count))
-        if (area := self.place_map.area) is not None:
-            best, order = best.sort(1, descending=True)
-            middle = self.coarse.place[GROUP * group.gather(1, order) + best % GROUP]
-            # further candidates lie around the highest peaks
-            peaks, reach = PEAKS + count, plan.coarse // 2
-            wide = reach + max((k > 1) * radius for k, radius in wanted)
-            parts = (middle[:, :peaks], wide), (middle[:, peaks:], reach)
-            near = [area.around(some.flatten(), far).view(*some.shape, -1).flatten(1) for some, far in parts]
-            place = torch.cat(near, 1).sort(1).values
-            return place.masked_fill(F.pad(place[:, 1:] == place[:, :-1], (0, 1)), -1)
+        groups = topk_groups(best, max(self.plan.refined, 2 * count))
+        windows = {1: self._along_route, 2: self._over_area}[self.place_map.layout.dimensions]
+        return windows(units, groups, wanted, count)
+
+    def _over_area(self, units: Tensor, groups: TopK, wanted: list[NmsSpec], count: int) -> Tensor:
+        (group, best), layout = groups, self.place_map.layout
+        best, order = best.sort(1, descending=True)
+        middle = self.coarse.place[GROUP * group.gather(1, order) + best % GROUP]
+        # further candidates lie around the highest peaks
+        peaks, reach = PEAKS + count, self.plan.coarse // 2
+        wide = reach + max((k > 1) * radius for k, radius in wanted)
+        parts = (middle[:, :peaks], wide), (middle[:, peaks:], reach)
+        near = [layout.around(some.flatten(), far).view(*some.shape, -1).flatten(1) for some, far in parts]
+        place = torch.cat(near, 1).sort(1).values
+        return place.masked_fill(F.pad(place[:, 1:] == place[:, :-1], (0, 1)), -1)
+
+    def _along_route(self, units: Tensor, groups: TopK, wanted: list[NmsSpec], count: int) -> Tensor:
+        (group, best), plan, places = groups, self.plan, self.place_map.places
         reach = -(-plan.coarse // (2 * plan.fine))
         offsets = torch.arange(-reach, reach + 1, device=group.device)
         middle = self.middle[GROUP * group + best % GROUP]
@@ -250,6 +256,6 @@ class CoarseSearch(Scan):
         enough = num_needed(wanted, self.place_map.layout) - 1
         if bool((score.isfinite().sum(1) > enough).all()):
             return score.new_zeros(len(score), dtype=torch.bool)
-        area = self.place_map.area
-        last = [best_candidates(score, *spec, place, area).score[:, -1] for spec in wanted]
+        layout = self.place_map.layout
+        last = [best_candidates(score, *spec, place, layout).score[:, -1] for spec in wanted]
         return torch.stack(last).isinf().any(0)

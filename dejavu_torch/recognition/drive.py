@@ -12,13 +12,14 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from dejavu_torch.memory import in_one_thread
+from dejavu_torch.places.layout import ROUTE
+from dejavu_torch.places.states import States
 from dejavu_torch.recognition.calibration import Platt, best_pair, confidence, confidence_of
 from dejavu_torch.recognition.evidence import Spacing, spacing_of
 from dejavu_torch.recognition.filter import near_scores
 from dejavu_torch.recognition.flight import place_flight
 from dejavu_torch.recognition.large import TILE, LargeDrive, Tiles, is_large
-from dejavu_torch.recognition.motion import States
-from dejavu_torch.recognition.plane import SHARP, near_in_plane
+from dejavu_torch.recognition.plane import FLOWN
 from dejavu_torch.recognition.select import best_candidates
 from dejavu_torch.recognition.smoother import (
     Drive,
@@ -28,7 +29,7 @@ from dejavu_torch.recognition.smoother import (
     check_descriptors,
     normalised,
 )
-from dejavu_torch.recognition.taken import ALONE, FEW, OF_AREA, STANDS_OUT, UPPER, doubted, singly
+from dejavu_torch.recognition.taken import ALONE, FEW, SURER, UPPER, doubted, singly
 from dejavu_torch.text import progress_of
 from dejavu_torch.types import Match
 
@@ -86,9 +87,9 @@ class DriveQuery(NamedTuple):
         )
         if self.null is not None and not few:
             known, apart = self.smoother, self.radius
-            sure = lambda scores: confidence(best_pair(scores, known.area, apart=apart))  # noqa: E731
+            sure = lambda scores: confidence(best_pair(scores, known.layout, apart=apart))  # noqa: E731
             found = singly(self.rows, self.null, spacing.weight.cpu(), sure)
-            least = STANDS_OUT if known.area is None else OF_AREA
+            least = SURER[known.layout.dimensions]
             known.singly = found._replace(nats=known.nats_per_query, least=least)
             known.is_drive &= known.singly.stands_out
 
@@ -153,25 +154,20 @@ def _shown(asked: DriveQuery, seen: Seen) -> Shown:
     """The answers of some queries."""
     mass, scores, known = seen
     smoother, queries = asked.smoother, len(asked.descriptors)
-    area, within = smoother.area, smoother.within
+    layout, within = smoother.layout, smoother.within
+    beside = (layout if known is None else ROUTE).reaching(mass.shape[1])  # of the columns
     ranked = scores = scores.masked_fill(scores.isnan(), math.inf)
-    if asked.answers and area is None:
-        ranked = near_scores(mass, scores, within)
-    elif asked.answers and area is not None:
-        near = near_in_plane(mass, SHARP, area, weighted=True).clamp(min=torch.finfo(mass.dtype).tiny)
-        ranked = (-near.log()).masked_fill(~scores.isfinite(), math.inf)
+    if asked.answers:
+        ranked = near_scores(mass, scores, max(within, FLOWN[layout.dimensions]), beside)
     columns = None if known is None else known.expand_as(ranked)
-    sure = confidence(best_pair(ranked, area, columns))
-    match = best_candidates(ranked, asked.k, asked.radius, columns, area)
+    sure = confidence(best_pair(ranked, layout, columns))
+    match = best_candidates(ranked, asked.k, asked.radius, columns, layout)
     at = match.index[:, :1].clamp(min=0)
     if known is not None:
         at = torch.searchsorted(known, at).clamp(max=len(known) - 1)
-    if area is None:
-        probability = mass_around(mass, at, within)
-    else:
-        probability = near_in_plane(mass, within, area).gather(1, at)[:, 0]
+    probability = beside.mass_near(mass, at[:, 0], within)
     if not asked.answers and asked.platt is not None:
-        by_itself = asked.platt.probability(confidence_of(scores, area, asked.platt.margin))
+        by_itself = asked.platt.probability(confidence_of(scores, layout, asked.platt.margin))
         trusted = queries == 1 or (smoother.singly is not None and smoother.singly.enough)
         probability = by_itself if trusted else torch.minimum(probability, by_itself)
     if not asked.answers and smoother.singly is not None:
@@ -210,16 +206,10 @@ def _seen(
     fitted: dict[tuple[int, States, int], list[tuple[int, Drive]]] = {}
     for i, (asked, places) in enumerate(zip(drives, sizes, strict=True)):
         rows, descriptors, smoother, _, _, starts, *_ = asked
-        if smoother.area is not None:
-            near = spacing_of(check_descriptors(descriptors))
-            mass = place_flight(smoother, rows, len(descriptors), smoother.area, near)
-            asked.ask_singly(near)
+        along = _of_windows if is_large(len(descriptors), places) else None
+        if alone := {1: along, 2: _of_flight}[smoother.layout.dimensions]:
             fitted_one(1)
-            yield i, Seen(mass.double(), rows(torch.arange(len(descriptors))).cpu())
-            continue
-        if is_large(len(descriptors), places):
-            fitted_one(1)
-            yield from ((i, seen) for seen in _of_windows(asked, places, progress))
+            yield from ((i, seen) for seen in alone(asked, places, progress))
             continue
         spacing = spacings.get(id(descriptors))
         spacing = spacings[id(descriptors)] = spacing_of(descriptors) if spacing is None else spacing
@@ -237,6 +227,14 @@ def _seen(
             for (i, drive), posterior in zip(alike, block.posterior, strict=True):
                 asked = drives[i]
                 yield i, Seen(_mass(posterior), drive.rows(numbers).cpu())
+
+
+def _of_flight(asked: DriveQuery, places: int, progress: bool) -> Iterator[Seen]:
+    """What is seen of a drive over an area."""
+    spacing, queries = spacing_of(check_descriptors(asked.descriptors)), len(asked.descriptors)
+    mass = place_flight(asked.smoother, asked.rows, queries, asked.smoother.layout, spacing)
+    asked.ask_singly(spacing)
+    yield Seen(mass.double(), asked.rows(torch.arange(queries)).cpu())
 
 
 def _of_windows(asked: DriveQuery, places: int, progress: bool) -> Iterator[Seen]:
@@ -274,13 +272,6 @@ def _kept(rows: Rows, every: bool) -> Rows:
 
 def _mass(posterior: Tensor) -> Tensor:
     return normalised(PlaceSmoother.folded(posterior.cpu().double()))[:, :-1]
-
-
-def mass_around(mass: Tensor, at: Tensor, radius: int) -> Tensor:
-    """The mass of a place (Q,1) and its neighbours up to a radius, (Q,N) -> (Q,)."""
-    near = at + torch.arange(-radius, radius + 1)
-    inside = (near >= 0) & (near < mass.shape[1])
-    return (mass.gather(1, near.clamp(0, mass.shape[1] - 1)) * inside).sum(1).clamp(0, 1)
 
 
 def doubt(own: Tensor) -> Tensor:

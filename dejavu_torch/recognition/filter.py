@@ -4,23 +4,25 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from dejavu_torch.area import Area
 from dejavu_torch.memory import is_plain, without_autocast
-from dejavu_torch.recognition.motion import MIN_PROBABILITY, Motion, Rates, States, checked_rates, logits
+from dejavu_torch.places.layout import ROUTE, Layout
+from dejavu_torch.places.states import States
+from dejavu_torch.recognition.motion import MIN_PROBABILITY, Motion, Rates, checked_rates, logits
 from dejavu_torch.recognition.online import Learned
-from dejavu_torch.recognition.plane import SHARP, Followed, PlaneMotion, near_in_plane
+from dejavu_torch.recognition.plane import SHARP, Followed, PlaneMotion
 from dejavu_torch.recognition.sequence import each
 from dejavu_torch.types import InputError, SequenceModel, expect
 
-MOVES = (0.2, 0.6, 0.2)
-PLANE_MOVES, PLANE_SHARPNESS = (1 / 6,) * 6, 2.0  # of an area, where images are farther apart
+# by the dimensions of a layout; over an area images are farther apart
+MOVES = {1: (0.2, 0.6, 0.2), 2: (1 / 6,) * 6}
+SHARPNESS = {1: 1.0, 2: 2.0}
 
 
 class Moments(NamedTuple):
@@ -95,7 +97,7 @@ class PlaceFilter(SequenceModel):
 
     def __init__(
         self,
-        moves: Sequence[float] = MOVES,
+        moves: Sequence[float] = MOVES[1],
         jump: float = 0.001,
         leave: float = 0.001,
         enter: float = 0.01,
@@ -119,18 +121,17 @@ class PlaceFilter(SequenceModel):
         self.log_sharpness = nn.Parameter(torch.tensor(float(sharpness), dtype=torch.float32).log())
         self.off_map = nn.Parameter(torch.tensor(float(off_map), dtype=torch.float32))
         self.within, self.threshold, self.lag, self.learns = within, threshold, lag, learns
-        self.area: Area | None = None  # of the places, which a `Localizer` sets
+        self.layout = ROUTE  # of the places, which a `Localizer` sets
 
-    def over(self, area: Area | None) -> PlaceFilter:
-        """A copy for the places of an area, or of a route; moves and sharpness of an area replace those of a
-        route by default."""
+    def over(self, layout: Layout) -> PlaceFilter:
+        """A copy for places that lie so; moves and sharpness for an area replace those for a route by
+        default."""
         copied = copy.deepcopy(self)
-        copied.area = area
-        if area is not None and self.area is None:
-            if torch.equal(self.move_logits.cpu(), logits(*MOVES)):
-                copied.move_logits = nn.Parameter(logits(*PLANE_MOVES).to(self.off_map.device))
-            if float(self.log_sharpness.detach()) == 0:
-                copied.log_sharpness.data.fill_(math.log(PLANE_SHARPNESS))
+        copied.layout = layout
+        if torch.equal(self.move_logits.cpu().float(), logits(*MOVES[1])):
+            copied.move_logits = nn.Parameter(logits(*MOVES[layout.dimensions]).to(self.off_map.device))
+        if float(self.log_sharpness.detach()) == 0:
+            copied.log_sharpness.data.fill_(math.log(SHARPNESS[layout.dimensions]))
         return copied
 
     def start(self, places: int, fixed: bool = False) -> Tensor:
@@ -144,7 +145,7 @@ class PlaceFilter(SequenceModel):
 
     def near(self, posterior: Tensor, scores: Tensor) -> Tensor:
         """`near_scores` of this filter."""
-        return near_scores(posterior, scores, self.within, self.area)
+        return near_scores(posterior, scores, self.within, self.layout)
 
     def posterior(self, scores: Tensor, before: Tensor | None = None) -> Tensor:
         """Probability of each place, and of being off the map, after each query; with a lag, given the
@@ -197,9 +198,7 @@ class PlaceFilter(SequenceModel):
     @property
     def _learned(self) -> type[Learned] | type[Followed] | None:
         """The kind of what is learned on the way."""
-        if self.area is not None:
-            return Followed
-        return Learned if self.learns else None
+        return {1: Learned if self.learns else None, 2: Followed}[self.layout.dimensions]
 
     def _parts(self, state: Tensor) -> tuple[Tensor, Tensor, Learned | Followed | None, Tensor]:
         """Posterior of the latest answer (N+1,), that of the filter, what is learned, and (R,N+1) queries
@@ -296,9 +295,7 @@ class PlaceFilter(SequenceModel):
         moves, (_, jump, leave) = (one.to(like).softmax(0) for one in (self.move_logits, self.rate_logits))
         moves = moves if learned is None else learned.moves_after(moves)
         rates = Rates(moves, jump, leave, self.enter_logit.to(like).sigmoid())
-        if self.area is not None:
-            return PlaneMotion(self.area, rates)
-        return Motion(States(like.shape[-1], route_starts=tuple(route_starts)), rates)
+        return MOTIONS[self.layout.dimensions](self.layout, rates, like.shape[-1], route_starts)
 
     def check(self, queries: int | None, places: int) -> None:
         seen = f"a lag of {self.lag} where all queries are known"
@@ -323,6 +320,18 @@ class PlaceFilter(SequenceModel):
         )
 
 
+def _along(layout: Layout, rates: Rates, places: int, route_starts: Sequence[int]) -> Motion:
+    unknown = States(places, route_starts=tuple(route_starts))
+    return Motion(layout.states() if layout.places else unknown, rates)
+
+
+# by the dimensions of a layout
+MOTIONS: Mapping[int, Callable[[Layout, Rates, int, Sequence[int]], Motion | PlaneMotion]] = {
+    1: _along,
+    2: lambda layout, rates, *_: PlaneMotion(layout, rates),
+}
+
+
 def check_posterior(before: Tensor | None, places: int) -> None:
     """Refuse what are no probabilities (..., N+1), unless their numbers cannot be read."""
     if before is None or not is_plain(before) or not before.numel():
@@ -335,33 +344,12 @@ def check_posterior(before: Tensor | None, places: int) -> None:
 
 
 @without_autocast
-def near_scores(posterior: Tensor, scores: Tensor, within: int, area: Area | None = None) -> Tensor:
+def near_scores(posterior: Tensor, scores: Tensor, within: int, layout: Layout = ROUTE) -> Tensor:
     """-log of the probability of each place and its neighbours, weighted by a triangle that ends `within`
     places away, in an area by a pyramid that ends sooner, (Q,N) -> (Q,N); +inf if the place's score is."""
-    within = min(within, posterior.shape[1])
-    side = within + 1  # two box filters make a triangle
-    if area is not None:
-        mass = near_in_plane(posterior, min(within, SHARP), area, weighted=True) if within else posterior
-    else:
-        mass = window_sums(window_sums(F.pad(posterior, (within, within)), side), side) / side
+    mass = layout.blurred(posterior, min(within, SHARP[layout.dimensions]))
     mass = mass.clamp(torch.finfo(mass.dtype).tiny, 1.0)  # an exporter promotes no types
     return (-mass.log()).masked_fill(~scores.isfinite(), math.inf)
-
-
-def window_sums(values: Tensor, width: int) -> Tensor:
-    """Sums of `width` neighbours, (..., N + width - 1) -> (..., N).
-
-    Example:
-        >>> window_sums(torch.tensor([1.0, 2, 3, 4]), 3)
-        tensor([6., 9.])
-    """
-    count, size, at, total = values.shape[-1] - width + 1, 1, 0, torch.zeros(())
-    while True:  # sums of 1, 2, 4, .. neighbours, which is several times as fast as pooling
-        if width & size:
-            total, at = total + values.narrow(-1, at, count), at + size
-        if (size := 2 * size) > width:
-            return total
-        values = values[..., : -(size // 2)] + values[..., size // 2 :]
 
 
 def updated(expected: Tensor, likelihood: Tensor) -> Tensor:

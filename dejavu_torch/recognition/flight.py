@@ -12,11 +12,11 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from dejavu_torch.area import Area
 from dejavu_torch.memory import check_room
+from dejavu_torch.places.layout import Layout, boxes
 from dejavu_torch.recognition.evidence import RankTable, Spacing, Standardised, place_means, standardised
 from dejavu_torch.recognition.motion import MIN_PROBABILITY, logits
-from dejavu_torch.recognition.plane import Steps, as_plane, boxes, by_place, rings
+from dejavu_torch.recognition.plane import Steps, inside_of, rings
 from dejavu_torch.recognition.smoother import (
     MOVE_SHARE,
     RADIUS,
@@ -45,7 +45,9 @@ class Swept(NamedTuple):
 
 
 @torch.no_grad()
-def place_flight(smoother: PlaceSmoother, rows: Rows, queries: int, area: Area, spacing: Spacing) -> Tensor:
+def place_flight(
+    smoother: PlaceSmoother, rows: Rows, queries: int, layout: Layout, spacing: Spacing
+) -> Tensor:
     """The mass of each window of an area for each query of a flight, (Q,N); what is off the area is missing.
     The smoother knows afterwards what was learned from the queries, and whether they are a flight over it.
 
@@ -55,7 +57,7 @@ def place_flight(smoother: PlaceSmoother, rows: Rows, queries: int, area: Area, 
     Raises:
         InputError: more queries and windows than fit into memory.
     """
-    cells = area.rows * area.columns
+    cells = layout.rows * layout.columns
     check_room(BYTES * queries * cells, f"a drive of {queries} images over {cells} rows x columns")
     smoother.forget()
     scores = rows(torch.arange(queries)).float().cpu()
@@ -73,27 +75,27 @@ def place_flight(smoother: PlaceSmoother, rows: Rows, queries: int, area: Area, 
     separation, table = SEPARATION, ranks
     for _ in range(ROUNDS):
         values = table.values
-        swept = _sweep(smoother, area, some, own, spacing.still[part], values, separation, kernel)
-        others = by_place(swept.others, area) * (own * some.speaks)[:, None]
+        swept = _sweep(smoother, layout, some, own, spacing.still[part], values, separation, kernel)
+        others = layout.by_place(swept.others) * (own * some.speaks)[:, None]
         known = some.only(RankTable.look_up(values, some.z), 0)
         separation = max(1.0, float((others * known).sum() / others.sum().clamp(min=MIN_PROBABILITY)))
         table = RankTable(ranks.counts)
-        near = by_place(boxes(swept.mass, RADIUS).clamp(0, 1), area)
+        near = layout.by_place(boxes(swept.mass, RADIUS).clamp(0, 1))
         table.add(some.z, some.only(-near * (own * some.speaks)[:, None], 0))
         kernel = swept.moves + prior
         kernel = kernel / kernel.sum()
-    swept = _sweep(smoother, area, std, weight, spacing.still, table.values, separation, kernel)
+    swept = _sweep(smoother, layout, std, weight, spacing.still, table.values, separation, kernel)
     smoother.separation, smoother.log_likelihood = separation, swept.log
     smoother.nats_per_query = smoother.tempering * swept.log / max(1.0, float(weight.sum()))
     smoother.is_drive = moves_along(swept.log, smoother.nats_per_query)  # jumps are not learned
     moves = torch.zeros(reach + 1).index_add_(0, rings(reach).flatten(), kernel.flatten())
     smoother.move_logits.copy_(logits(*moves.tolist()))
-    return by_place(swept.mass, area)
+    return layout.by_place(swept.mass)
 
 
 def _sweep(
     smoother: PlaceSmoother,
-    area: Area,
+    layout: Layout,
     std: Standardised,
     weight: Tensor,
     still: Tensor,
@@ -103,10 +105,11 @@ def _sweep(
 ) -> Swept:
     """Forward and backward over the queries."""
     log = log_likelihood(values, std, weight, separation, smoother.tempering)
-    seen = as_plane(log.exp(), area)
+    seen = layout.as_plane(log.exp())
     _, jump, leave = smoother.rate_logits.softmax(0)
-    inside = None if area.inside is None else area.inside.to(seen)
-    steps = Steps((1 - jump - leave) * kernel, jump, leave, smoother.enter_logit.sigmoid(), inside)
+    steps = Steps(
+        (1 - jump - leave) * kernel, jump, leave, smoother.enter_logit.sigmoid(), inside_of(layout, seen)
+    )
     off, total = seen.new_tensor(0.5), 0.0
     belief = 0.5 * steps.even(seen[0]).expand(seen.shape[1:])
     before, after = torch.empty_like(seen), torch.empty_like(seen)  # beliefs without and with each query

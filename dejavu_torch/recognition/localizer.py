@@ -13,10 +13,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from dejavu_torch.area import Area
 from dejavu_torch.maps.place_map import PlaceMap
 from dejavu_torch.maps.spectral_map import SpectralMap
 from dejavu_torch.memory import in_one_thread
+from dejavu_torch.places.layout import ROUTE, Layout
 from dejavu_torch.recognition.calibration import TOLERANCE, Platt, Track, best_pair, confidence_of
 from dejavu_torch.recognition.calibration import confidence as confidence_of_pair
 from dejavu_torch.recognition.drive import DriveQuery, first_of, localize_drive
@@ -32,8 +32,7 @@ from dejavu_torch.recognition.taken import (
     AT_FIRST,
     EVERY,
     FAITHFUL,
-    OF_AREA,
-    STANDS_OUT,
+    SURER,
     Running,
     doubted,
     flipped,
@@ -77,7 +76,7 @@ class Localizer:
     Args:
         route: the map; None if only `match` is used, with scores from elsewhere.
         searcher: finds the best places of single queries; None is a `Scan`.
-        area: of the places, without a map.
+        layout: of the places, without a map.
 
     Shape: descriptors (B,K) of the next queries, or (B x copies, K) -> Match of (B,), or (B,k), on the CPU,
         without gradients.
@@ -97,21 +96,19 @@ class Localizer:
         place_map: PlaceMap | None = None,
         matching: Matching = SINGLE,
         searcher: Searcher | None = None,
-        area: Area | None = None,
+        layout: Layout = ROUTE,
     ) -> None:
-        # of the places; None along a route
-        self.area = area if place_map is None else place_map.area
+        self.layout = layout = layout if place_map is None else place_map.layout  # of the places
         in_area = {
-            T: one.over(self.area) if isinstance(one, PlaceFilter) else one
-            for T, one in matching.also.items()
+            T: one.over(layout) if isinstance(one, PlaceFilter) else one for T, one in matching.also.items()
         }
         sequence = matching.sequence
         if isinstance(sequence, PlaceFilter):
-            sequence = sequence.over(self.area)
+            sequence = sequence.over(layout)
         matching = matching._replace(sequence=sequence, also=in_area)
-        self.place_map, self.matching, self.track = place_map, matching, Track(self.area)
+        self.place_map, self.matching, self.track = place_map, matching, Track(layout)
         # what single images say so far, beside mirrored ones, if these are asked
-        self.running = Running(STANDS_OUT if self.area is None else OF_AREA)
+        self.running = Running(SURER[layout.dimensions])
         self.lock = threading.RLock()
         self.total: Tensor | None = None  # of the queries so far
         asks = isinstance(sequence, PlaceFilter) and matching.platt is not None and matching.copies == 1
@@ -126,7 +123,7 @@ class Localizer:
             self.models[self.own] = sequence
         self.states: dict[Together, Tensor] = {}  # of the models; empty before the first query
         self.matched = 0  # queries so far
-        self.route_starts = (0,) if place_map is None else place_map.route_starts
+        self.route_starts = layout.starts
 
     def __call__(self, descriptors: Tensor, progress: bool = False) -> Match:
         with self.alone_asked():
@@ -181,7 +178,7 @@ class Localizer:
         some = (numbers < AT_FIRST) | (numbers % EVERY == 0)
         if bool(some.any()):
             scores = place_map.scores(flipped(descriptors[some], mean=means[some]))
-            found[some] = confidence_of(scores, self.area)
+            found[some] = confidence_of(scores, self.layout)
         self.total = sums[-1]
         return found
 
@@ -190,9 +187,9 @@ class Localizer:
         """Match the next queries by their scores: (B,N), or (B x copies, N) -> (B,), or (B,k); mirrored: see
         `_mirrored`."""
         if mirrored is not None:
-            odds = self.running(confidence_of(scores, self.area), mirrored)
+            odds = self.running(confidence_of(scores, self.layout), mirrored)
             platt = self.matching.single or Platt(0.0, math.inf)
-            alone = platt.probability(confidence_of(scores, self.area, platt.margin))
+            alone = platt.probability(confidence_of(scores, self.layout, platt.margin))
             self.alone = torch.cat([self.alone, alone])
             match = self.match(scores)
             return self._doubted(match, odds[len(odds) - len(match.index) :])
@@ -246,7 +243,7 @@ class Localizer:
 
     def _heading_of(self, turn: Tensor, index: Tensor) -> Tensor:
         """The heading of copies in degrees, NaN where the place `index` is -1."""
-        heading = turn * (360 / self.matching.copies) - (0 if self.area is None else self.area.north)
+        heading = turn * (360 / self.matching.copies) - self.layout.north
         return (heading % 360).float().masked_fill(index < 0, torch.nan)
 
     def drive_query(
@@ -262,7 +259,7 @@ class Localizer:
             tiles = Tiles(blocks, place_map.block_places)
 
         smoother.map_links = () if place_map is None else place_map.connections
-        smoother.area = self.area
+        smoother.layout = self.layout
         smoother.removed = matching.removed
 
         def rows(queries: Tensor) -> Rows:
@@ -323,7 +320,7 @@ class Localizer:
         return state if state is None or state.ndim == 1 else state[0]
 
     def _alone(self, scores: Tensor, turn: Tensor | None) -> Match:
-        return self._answer(self._candidates(scores, turn), best_pair(scores, self.area))
+        return self._answer(self._candidates(scores, turn), best_pair(scores, self.layout))
 
     def _in_sequence(self, scores: Tensor, turn: Tensor | None = None, last: bool = False) -> Match:
         states = self.states or {T: m.start(scores.shape[1]).to(scores) for T, m in self.models.items()}
@@ -335,7 +332,7 @@ class Localizer:
             answered = torch.cat([filter.waiting(states[self.own]), scores])
             scores, turn = answered[: len(steps[self.own][0])], None  # not those of the queries answered
         final = scores if single else steps[self.own][0]
-        pair, confidence = best_pair(final, self.area), None
+        pair, confidence = best_pair(final, self.layout), None
         if self.matching.platt is not None and not single:
             confidence = self.track(final, scores)
         match = self._answer(self._candidates(final, turn), pair, confidence)
@@ -346,7 +343,7 @@ class Localizer:
     def _candidates(self, scores: Tensor, turn: Tensor | None = None) -> Match:
         if self.matching.callback is not None:
             self.matching.callback(scores)
-        match = best_candidates(scores, self.matching.k or 1, self.matching.radius, area=self.area)
+        match = best_candidates(scores, self.matching.k or 1, self.matching.radius, layout=self.layout)
         best = None if turn is None else turn.gather(1, match.index.clamp(min=0))
         return match if best is None else replace(match, heading=self._heading_of(best, match.index))
 
@@ -371,8 +368,7 @@ class Localizer:
         match = replace(match, accepted=accept(match.score, threshold))
         if match.probability is not None and precision is not None:
             match = replace(match, accepted=match.probability >= precision)
-        if self.place_map is not None and self.place_map.routes:
-            match = replace(match, route=self.place_map.table.route_of(match.index))
+        match = replace(match, route=self.layout.told_routes(match.index))
         return match if matching.k is not None else match.map(lambda column: column[:, 0])
 
     def _search(self, descriptors: Tensor, wanted: list[NmsSpec]) -> Match:
@@ -382,7 +378,7 @@ class Localizer:
         copies, each = self.matching.copies, score.shape[1]
         # the best of all copies are among the best of each
         score, place = score.view(-1, copies * each), place.view(-1, copies * each)
-        match, pair = (best_candidates(score, *spec, place, self.area) for spec in wanted)
+        match, pair = (best_candidates(score, *spec, place, self.layout) for spec in wanted)
         if copies > 1:
             found = (place[:, None] == match.index[..., None]) & (score[:, None] == match.score[..., None])
             turn = found.byte().argmax(2) // each
@@ -394,15 +390,15 @@ def drive_query(
     queries: Tensor,
     smoother: PlaceSmoother,
     score: Scoring,
-    area: Area | None = None,
+    layout: Layout = ROUTE,
 ) -> DriveQuery:
     """Queries (Q,K) as a drive with scores of any kind, for a smoother like this one; see `Matching`.
 
     Args:
-        area: of the places; None along a route.
+        layout: of the places.
     """
     matching = Matching(removed=smoother.removed)
-    return Localizer(None, matching, area=area).drive_query(queries, copy.deepcopy(smoother), score)
+    return Localizer(None, matching, layout=layout).drive_query(queries, copy.deepcopy(smoother), score)
 
 
 def earlier(scores: Tensor, numbers: Tensor, apart: int) -> Tensor:

@@ -9,10 +9,12 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from dejavu_torch.area import Area
+from dejavu_torch.places.layout import Layout
 from dejavu_torch.recognition.motion import MIN_PROBABILITY, Counts, Rates
 
-SHARP = 2  # windows around a place whose mass an answer is chosen by
+# places around one whose mass an answer is chosen by, at most, and that of a drive at least, by the
+# dimensions of a layout
+SHARP, FLOWN = {1: 2**31, 2: 2}, {1: 0, 2: 2}
 PERSISTENCE = 0.95  # of learned moves from one query to the next
 MOVES_GIVEN = 5.0  # queries that the given moves count as
 
@@ -21,7 +23,7 @@ class Steps(NamedTuple):
     """A step over an area, and its transpose, of the mass of windows (R,C) and that of being off it ().
 
     kernel: (2 V + 1, 2 V + 1), probabilities of a move by rows and columns, `jump` and `leave` taken off.
-    jump, leave, enter: see `Motion`; a move over the border leaves the area. inside: (R,C), see `Area`.
+    jump, leave, enter: see `Motion`; a move over the border leaves the area. inside: (R,C), see `Layout`.
     """
 
     kernel: Tensor
@@ -106,12 +108,11 @@ class PlaneMotion:
         rates: with moves (M,) by rows and columns, see `Followed`.
     """
 
-    def __init__(self, area: Area, rates: Rates) -> None:
-        self.area, self.rates = area, rates
+    def __init__(self, layout: Layout, rates: Rates) -> None:
+        self.layout, self.rates = layout, rates
         side = math.isqrt(len(rates.moves))
         kernel = (1 - rates.jump - rates.leave) * rates.moves.view(side, side)
-        inside = None if area.inside is None else area.inside.to(kernel)
-        self.steps = Steps(kernel, rates.jump, rates.leave, rates.enter, inside)
+        self.steps = Steps(kernel, rates.jump, rates.leave, rates.enter, inside_of(layout, kernel))
 
     def moved(self, belief: Tensor) -> Tensor:
         """The belief before the next query."""
@@ -125,7 +126,7 @@ class PlaneMotion:
         """The belief before the first query, see `Motion.anywhere`."""
         _, _, leave, enter = self.rates
         off = (leave / (leave + enter).clamp(min=MIN_PROBABILITY)).clamp(max=0.5)
-        return torch.cat([((1 - off) / self.area.places).expand(self.area.places), off[None]])
+        return torch.cat([((1 - off) / self.layout.places).expand(self.layout.places), off[None]])
 
     def counts(self, before: Tensor, after: Tensor) -> Counts:
         """Expected numbers of steps, see `Motion.counts`, of one step: (1,N+1)."""
@@ -138,43 +139,19 @@ class PlaneMotion:
         return Counts(each[:-4], *each[-4:])
 
     def _split(self, state: Tensor) -> tuple[Tensor, Tensor]:
-        return as_plane(state[None, :-1], self.area)[0], state[-1]
+        return self.layout.as_plane(state[None, :-1])[0], state[-1]
 
     def _joined(self, on: Tensor, off: Tensor) -> Tensor:
-        return torch.cat([by_place(on[None], self.area)[0], off[None]])
+        return torch.cat([self.layout.by_place(on[None])[0], off[None]])
 
 
-def near_in_plane(mass: Tensor, radius: int, area: Area, weighted: bool = False) -> Tensor:
-    """The mass of each window and those up to a radius in rows and columns, or `weighted` by a pyramid that
-    is highest at the window, (Q,N) -> (Q,N)."""
-    plane = as_plane(mass, area)
-    if not weighted:
-        return by_place(boxes(plane, radius), area).clamp(0, 1)
-    half = max(1, radius // 2)  # two boxes make a pyramid, whole also at a border
-    pyramid = boxes(boxes(F.pad(plane, 4 * (half,)), half), half)[:, half:-half, half:-half]
-    return by_place(pyramid / (2 * half + 1) ** 2, area).clamp(0, 1)
-
-
-def boxes(mass: Tensor, radius: int) -> Tensor:
-    """Sums over squares of 2 radius + 1 windows to a side, (T,R,C) -> (T,R,C)."""
-    side = 2 * radius + 1
-    sums: Tensor = F.avg_pool2d(mass[:, None], side, 1, radius, divisor_override=1)[:, 0]
-    return sums
+def inside_of(layout: Layout, like: Tensor) -> Tensor | None:
+    """`Layout.inside`, in the type of other numbers."""
+    inside = layout.inside
+    return None if inside is None else inside.to(like)
 
 
 def rings(reach: int) -> Tensor:
     """The larger of the rows and columns of each move, (2 V + 1, 2 V + 1) int64."""
     away = torch.arange(-reach, reach + 1).abs()
     return torch.maximum(away[:, None], away)
-
-
-def as_plane(values: Tensor, area: Area) -> Tensor:
-    """Values by place, (T,N) -> (T,R,C), 0 where there is none."""
-    order = area.orders()[0].to(values.device)
-    values = F.pad(values, (0, 1)) if area.parts else values
-    return values.index_select(1, order).view(len(values), area.rows, area.columns)
-
-
-def by_place(values: Tensor, area: Area) -> Tensor:
-    """Values of a plane by place, (T,R,C) -> (T,N)."""
-    return values.flatten(1).index_select(1, area.orders()[1].to(values.device))

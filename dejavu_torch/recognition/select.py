@@ -9,7 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from dejavu_torch.places.layout import Layout
+from dejavu_torch.places.layout import ROUTE, Layout
 from dejavu_torch.types import Match, check_shape, expect
 
 HIGHEST = torch.finfo(torch.float64).max  # threshold that accepts every finite score; JSON has no infinity
@@ -61,13 +61,13 @@ def best_match(scores: Tensor, threshold: float | None = None) -> Match:
 
 
 def best_candidates(
-    scores: Tensor, k: int, radius: int, places: Tensor | None = None, area: Layout | None = None
+    scores: Tensor, k: int, radius: int, places: Tensor | None = None, layout: Layout = ROUTE
 ) -> Match:
     """The k best places of each query, by non-maximum suppression with a radius in places.
 
     Args:
-        places: (Q,N) of the scores, if they are not all places in order. area: where the places lie; the
-            radius counts rows and columns. None is a route.
+        places: (Q,N) of the scores, if they are not all places in order. layout: where the places lie, by
+            default along a route.
 
     Shape: (Q,N) -> Match of (Q,k).
 
@@ -77,7 +77,7 @@ def best_candidates(
     expect(isinstance(scores, Tensor), "a tensor (Q,N)", f"scores are a {type(scores).__name__}")
     check_shape(scores, "Q N>=1", "scores are")
     check_candidates(k, radius, scores.shape[1])
-    layout, found = area or Layout(scores.shape[1]), []
+    layout, found = layout.reaching(scores.shape[1]), []
     for rank in range(k):
         score, at = scores.min(1)
         index = at if places is None else places.gather(1, at[:, None])[:, 0]

@@ -84,8 +84,8 @@ class SequenceMatcher(SequenceModel):
         rows = torch.cat([state.to(scores), scores])
         before = (~state[:, :1].isnan()).sum()
         used = (torch.arange(1, len(scores) + 1, device=rows.device) + before).clamp(max=self.length)
-        routes = [self._best(part, used) for part in rows.tensor_split([*route_starts[1:]], 1)]
-        best = routes[0] if len(routes) == 1 else torch.cat(routes, 1)
+        parts = [self._best(part, used) for part in rows.tensor_split([*route_starts[1:]], 1)]
+        best = parts[0] if len(parts) == 1 else torch.cat(parts, 1)
         return best, rows[max(0, len(rows) - self.length + 1) :]
 
     def _best(self, rows: Tensor, used: Tensor) -> Tensor:

@@ -11,8 +11,8 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 from typing_extensions import Self
 
-from dejavu_torch.area import Area
-from dejavu_torch.maps.frame_table import Link
+from dejavu_torch.places.layout import ROUTE, window_sums
+from dejavu_torch.places.states import Link, States
 from dejavu_torch.recognition.evidence import (
     RankTable,
     Spacing,
@@ -22,13 +22,12 @@ from dejavu_torch.recognition.evidence import (
     speaking,
     standardised,
 )
-from dejavu_torch.recognition.filter import near_scores, window_sums
+from dejavu_torch.recognition.filter import near_scores
 from dejavu_torch.recognition.motion import (
     MIN_PROBABILITY,
     Counts,
     Motion,
     Rates,
-    States,
     checked_rates,
     logits,
 )
@@ -183,7 +182,7 @@ class PlaceSmoother(SequenceModel):
         self.within, self.threshold = within, threshold
         self.links, self.loop = tuple(links), loop
         self.map_links: tuple[Link, ...] = ()  # those of the map that a `Localizer` matches to
-        self.area: Area | None = None  # of that map's places, see `place_flight`
+        self.layout = ROUTE  # of that map's places
         self.removed = 1.0  # share of each place's mean score that is removed
         self.log_likelihood: float | None = None  # nats above being off the map throughout, as fitted
         self.nats_per_query = 0.0  # likewise, with rare jumps, as if queries did not depend on each other

@@ -27,6 +27,7 @@ UPPER = 0.1  # share of the queries that have to be sure: the others may be off 
 STANDS_OUT, A_LITTLE, PLAINLY = 0.21, 0.1, 3.0
 BY_THEMSELVES = 0.4  # likewise: of 417 drives over other ground one has more than .2, and it has .37
 OF_AREA = 0.34  # in place of `STANDS_OUT`: over a plane a path may turn anywhere, so its motion tells less
+SURER = {1: STANDS_OUT, 2: OF_AREA}  # by the dimensions of a layout
 FAITHFUL = 0.7  # of the descriptors are kept: the code of a map that keeps less hides what single images tell
 ALONE = 0.55  # nats for each query that its motion alone has to show there
 NATS = 10.0  # by which a drive beats being off the map throughout

@@ -17,7 +17,6 @@ from torch.utils.data import DataLoader, Dataset, DistributedSampler
 
 from dejavu_torch.data.files import LARGEST
 from dejavu_torch.data.ground_truth import GroundTruth, as_ground_truth, ground_truth_in_places
-from dejavu_torch.data.positions import place_of
 from dejavu_torch.data.source import as_traverse, routes_of
 from dejavu_torch.data.traverse import runs as runs_of
 from dejavu_torch.features.augmentation import Augmentation
@@ -27,6 +26,7 @@ from dejavu_torch.memory import check_room, concatenate, free_memory
 from dejavu_torch.model import DejaVu
 from dejavu_torch.motion.odometry import GroundOdometry
 from dejavu_torch.motion.resampling import ResampledTraverse, ground_truth_of, resampled
+from dejavu_torch.places.positions import place_of
 from dejavu_torch.resize import resize_frames
 from dejavu_torch.types import InputError, Traverse, expect
 
@@ -196,11 +196,11 @@ class RouteData(LightningDataModule):
             raise InputError(f"{seen}; expected 0 or more, and batches of at least 2 frames in whole clips")
         if resize is not None and (len(resize) != 2 or min(resize) < 1):
             raise InputError(f"resize is {resize}; expected (height, width), at least 1 pixel each")
-        routes = routes_of(source) if isinstance(source, (str, Path)) else source
-        self.listed = {"source": [*routes] if isinstance(routes, (list, tuple)) else [routes]}
+        given = routes_of(source) if isinstance(source, (str, Path)) else source
+        self.listed = {"source": [*given] if isinstance(given, (list, tuple)) else [given]}
         expect(self.listed["source"], "at least one traverse", "source is an empty list")
-        for name, given in (("second", second), ("validation", validation), ("query", query)):
-            self.listed[name] = self._one_each(name, given)
+        for name, other in (("second", second), ("validation", validation), ("query", query)):
+            self.listed[name] = self._one_each(name, other)
         self.truths = {
             "second": self._one_each("second_truth", second_truth),
             "validation": self._one_each("validation_truth", validation_truth),
@@ -226,7 +226,7 @@ class RouteData(LightningDataModule):
         self._clips: Clips | None = None
         self._stopped: dict[str, Any] | None = None  # of the checkpoint that is resumed
         self.velocity, self.held_out = velocity, held_out
-        self.routes: list[Traverse] = []  # at even steps if `velocity` is given
+        self.references: list[Traverse] = []  # at even steps if `velocity` is given
         self.sets: dict[str, StoredFrames] = {}
         self._smaller: tuple[int, int] | None = None  # size of the stored frames, if smaller than their own
 
@@ -244,12 +244,12 @@ class RouteData(LightningDataModule):
     @property
     def reference(self) -> Traverse:
         """The route, or the first of several."""
-        return self.routes[0]
+        return self.references[0]
 
     @property
     def route_name(self) -> str:
         """The name of the routes, for messages."""
-        return self.reference.name + f" and {len(self.routes) - 1} more" * (len(self.routes) > 1)
+        return self.reference.name + f" and {len(self.references) - 1} more" * (len(self.references) > 1)
 
     @property
     def lengths(self) -> list[int]:
@@ -266,7 +266,7 @@ class RouteData(LightningDataModule):
         """The first places of the held-out segments, which training never sees."""
         frames = self.sets["reference"].values
         # not for templates: unseen places would not be found
-        one_map = len(self.routes) == 1 and frames.ndim == 4 and self._of_task("made", True)
+        one_map = len(self.references) == 1 and frames.ndim == 4 and self._of_task("made", True)
         enough = len(frames) >= MIN_FRAMES and self.sources["validation"] is None
         if not (one_map and self.held_out and enough):
             return []
@@ -288,8 +288,8 @@ class RouteData(LightningDataModule):
             self._smaller = smaller
         if "reference" not in self.sets:
             opened = [self._open(source) for source in self.listed["source"]]
-            self.routes = [resampled(route, self.velocity, self.batch_size) for route in opened]
-            parts = [self._stored(route) for route in self.routes]
+            self.references = [resampled(route, self.velocity, self.batch_size) for route in opened]
+            parts = [self._stored(route) for route in self.references]
             places = torch.arange(sum(map(len, parts)))
             self.sets["reference"] = StoredFrames(parts, as_ground_truth(places[:, None]))
         if self._of_task("made"):
@@ -305,7 +305,7 @@ class RouteData(LightningDataModule):
     def _size(self) -> tuple[int, int] | None:
         """(height, width) of stored frames; None is their own size."""
         shape = self.reference.frame_shape
-        for route in self.routes[1:]:
+        for route in self.references[1:]:
             other = route.frame_shape
             if len(other) != len(shape) or other[0] != shape[0] or (other != shape and not self._smaller):
                 raise _shape_error(route.name, other, shape)
@@ -330,7 +330,7 @@ class RouteData(LightningDataModule):
 
     def _opened(self, name: str, i: int = 0) -> Traverse:
         """Another traverse of route i, resampled with the steps of the route."""
-        route = self.routes[i]
+        route = self.references[i]
         step = route.step if isinstance(route, ResampledTraverse) else None
         traverse = self._open(self.listed[name][i], route.frame_shape)
         return resampled(traverse, self.velocity, self.batch_size, step)
@@ -350,7 +350,7 @@ class RouteData(LightningDataModule):
             return
         parts, truths = zip(*(self._read_one(name, i) for i in given), strict=True)
         truth = truths[0]
-        if len(self.routes) > 1:
+        if len(self.references) > 1:
             known = [one.positives.masked_fill(~one.judged[:, None], -1) for one in truths]
             starts = [sum(self.lengths[:i]) for i in given]
             truth = _concatenated([p.where(p < 0, p + start) for p, start in zip(known, starts, strict=True)])
@@ -358,7 +358,7 @@ class RouteData(LightningDataModule):
 
     def _read_one(self, name: str, i: int) -> tuple[Tensor, GroundTruth]:
         """Another traverse of route i, and the places of that route that it shows."""
-        route, reference = self.routes[i], self.sets["reference"].parts[i]
+        route, reference = self.references[i], self.sets["reference"].parts[i]
         traverse = self._opened(name, i)
         values = self._stored(traverse)
         if values.shape[1:] != reference.shape[1:]:

@@ -125,8 +125,10 @@ class DescriptorTask(RouteTask):
         expect(frames.values.ndim != 2, "frames, or `dejavu learn`", f"{name} holds ready features")
         seen = f"{type(self.features).__name__} has nothing to train"
         expect(trainable(self.features), "parameters that are not frozen, or `dejavu learn`", seen)
-        seen = f"model.rate is {self.rate}, for the bits of one map, and there are {len(data.routes)} routes"
-        expect(not self.rate or len(data.routes) <= 1, "model.rate 0, or one route", seen)
+        seen = (
+            f"model.rate is {self.rate}, for the bits of one map, and there are {len(data.references)} routes"
+        )
+        expect(not self.rate or len(data.references) <= 1, "model.rate 0, or one route", seen)
         seen = "data.augmentation changes nothing, so the whitening has nothing to learn from"
         fits = self.dejavu.whitening is None or data.augmentation.acts or data.sources["second"] is not None
         expect(fits, "an augmentation, data.second, or model.whitening none", seen)
@@ -207,7 +209,7 @@ class DescriptorTask(RouteTask):
     def relearn(self) -> None:
         """In closed form from the rounded network, without using up random numbers of the training."""
         model, whitening = self.dejavu, self.dejavu.whitening
-        alone = self.data.reference if len(self.data.routes) == 1 else None
+        alone = self.data.reference if len(self.data.references) == 1 else None
         with in_bits(self.features, self.weight_bits), torch.random.fork_rng(), in_mode(model, False):
             features = self.of_reference(self.described)
             if whitening is not None:
@@ -223,7 +225,7 @@ class DescriptorTask(RouteTask):
 
     def deployed(self) -> DejaVu:
         model = super().deployed()
-        if len(self.data.routes) == 1:
+        if len(self.data.references) == 1:
             return model
         trained, bits = model.trained, model.weight_bits
         model = DejaVu(**(model.settings() | {"velocity": None})).eval()  # the descriptor of all routes

@@ -170,7 +170,7 @@ class RouteTask(pl.LightningModule):
 
     def _say_few(self) -> None:
         data = self.data
-        alone = data.sources["validation"] is None and len(data.routes) == 1
+        alone = data.sources["validation"] is None and len(data.references) == 1
         log.warning(
             "%s has %d frames, fewer than %d: the untrained map of `dejavu learn` is likely better%s",
             *(data.route_name, sum(data.lengths), MIN_FRAMES),
@@ -344,7 +344,7 @@ class RouteTask(pl.LightningModule):
 
     def _routes(self) -> Sequence[object]:
         """Names and lengths of several routes; empty for one, whose path may change."""
-        named = [[route.name, n] for route, n in zip(self.data.routes, self.data.lengths, strict=True)]
+        named = [[route.name, n] for route, n in zip(self.data.references, self.data.lengths, strict=True)]
         return named if len(named) > 1 else []
 
     def on_load_checkpoint(self, checkpoint: Facts) -> None:

@@ -31,9 +31,9 @@ from dejavu_torch.data.ground_truth import (
     padded,
     position_truth,
 )
-from dejavu_torch.data.positions import look_up
 from dejavu_torch.data.strip import SlidingWindow
 from dejavu_torch.data.traverse import frame_range
+from dejavu_torch.places.positions import look_up
 from dejavu_torch.types import Coordinates
 
 POSITIONS = st.lists(st.integers(-20, 20), min_size=1, max_size=12)

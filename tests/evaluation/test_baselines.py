@@ -7,7 +7,6 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dejavu_torch.area import Area
 from dejavu_torch.evaluation.baselines import (
     every,
     fair_stride,
@@ -16,6 +15,7 @@ from dejavu_torch.evaluation.baselines import (
     stored_frames,
 )
 from dejavu_torch.evaluation.quantiser import product_quantised
+from dejavu_torch.places.layout import Layout
 from dejavu_torch.recognition.localizer import Matching
 from dejavu_torch.recognition.sequence import SequenceMatcher
 
@@ -141,7 +141,7 @@ def test_the_best_place_elsewhere_is_another_stored_frame(k):
 
 
 def test_a_product_quantiser_of_an_area_skips_rows_and_columns():
-    area = Area(9, 12)
+    area = Layout(9, 12)
     rows = torch.randn(area.places, 16, generator=torch.Generator().manual_seed(0))
     found = quantised_every_kth(rows, 1.0, 1, area)
     stored = len(stored_frames(area.places, found.k, area)[0])

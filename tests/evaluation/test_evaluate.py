@@ -162,7 +162,7 @@ def resampled(tmp_path_factory):
     model.save(folder / "m.safetensors")
     query = model.resample(ArrayTraverse(footage(QUERY, noise=0.02)), model.step)
     match = model.localize(query)
-    write_matches(folder / "matches.csv", [match], query.frame, model.map.frame_of)
+    write_matches(folder / "matches.csv", [match], query.frame, model.map.table)
     nearest = (REFERENCE - QUERY[:, None]).abs().argmin(1).tolist()
     (folder / "truth.csv").write_text("".join(f"{q},{p}\n" for q, p in enumerate(nearest)))
     files = {"map": folder / "m.safetensors", "matches": folder / "matches.csv"}

@@ -12,7 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dejavu_torch.evaluation.matches import ELSEWHERE, read_matches, write_matches
-from dejavu_torch.maps.place_map import Route
+from dejavu_torch.places.frame_table import FrameTable
+from dejavu_torch.places.layout import Layout, Rectangle
 from dejavu_torch.types import InputError, Match
 
 INF = float("inf")
@@ -170,13 +171,10 @@ def lines(path):
 
 
 def test_convention_11_the_file_counts_frames_of_the_sources(tmp_path):
-    path, frames = tmp_path / "m.csv", torch.tensor([10, 14, 19])
-
-    def frame_of(places):
-        return torch.where(places >= 0, frames[places.clamp(min=0)], -1)
-
-    parts = [MATCH[:2], MATCH[2:]]
-    write_matches(path, parts, torch.tensor([4, 4, 7]), frame_of, Named("q{}.png"), Named("0:00:{:02}.000"))
+    path, parts = tmp_path / "m.csv", [MATCH[:2], MATCH[2:]]
+    steps = torch.tensor([-1.0] * 10 + [0.0] * 4 + [1.0] * 5 + [2.0])  # first at frames 10, 14 and 19
+    table = FrameTable(Layout(3), steps)
+    write_matches(path, parts, torch.tensor([4, 4, 7]), table, Named("q{}.png"), Named("0:00:{:02}.000"))
     assert lines(path)[1:] == [
         "4,19,0.5,1,q4.png,0:00:19.000",
         "4,-1,inf,0,q4.png,",
@@ -212,7 +210,7 @@ def test_pairs_are_the_names_of_the_rows_that_report_a_place(scratch, rows, rank
     index, score, accepted = (torch.tensor(column) for column in zip(*rows * (ranks or 1), strict=True))
     index = torch.where(index % 5 == 0, -1, index)
     path, pairs, names = scratch / "m.csv", scratch / "pairs.txt", (Named("q/{}.jpg"), Named("r\n{}.jpg"))
-    write_matches(path, [Match(index, score, accepted)], None, None, *names, ranks, (), pairs)
+    write_matches(path, [Match(index, score, accepted)], None, None, *names, ranks, pairs)
     with path.open(newline="") as file:
         kept = [row for row in csv.DictReader(file) if row["place"] != "-1"]
     expected = [[row["query_name"], row["place_name"]] for row in kept]
@@ -242,12 +240,12 @@ def test_neither_matches_nor_pairs_are_half_written(tmp_path):
 
 
 def test_places_of_several_routes_are_told_by_route_and_frame(tmp_path):
-    routes = (Route("out", 4, 8), Route("b,ack", 3, 5))
+    routes = Layout.of([Rectangle(4, frames=8), Rectangle(3, route=1, frames=5)], routes=["out", "b,ack"])
+    steps = torch.tensor([0.0, 0, 1, 1, 2, 2, 2, 3, 0, 0, 1, 1, 2])
     score, route = torch.tensor([0.1, 0.2, 0.3, INF, 0.5]), torch.tensor([0, 0, 1, -1, 1])
     match = Match(torch.tensor([0, 3, 4, -1, 6]), score, torch.ones(5) > 0, route=route)
     path = tmp_path / "m.csv"
-    frame_of = torch.tensor([0, 2, 4, 7, 8, 10, 12, -1])  # of all routes, one behind the other
-    write_matches(path, [match], None, lambda p: frame_of[p], (), Named("{}.png"), None, routes)
+    write_matches(path, [match], None, FrameTable(routes, steps), (), Named("{}.png"))
     rows = list(csv.DictReader(path.read_text(encoding="utf-8").splitlines()))
     assert [(row["place"], row["route"], row["place_name"]) for row in rows] == [
         ("0", "out", "0.png"),

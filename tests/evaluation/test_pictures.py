@@ -12,12 +12,12 @@ from torch import nn
 from dejavu_torch import HOG, Match, PlaceFilter, SpectrogramAnalysis
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.ground_truth import GroundTruth, as_ground_truth, offset_truth
-from dejavu_torch.data.positions import place_of
 from dejavu_torch.evaluation.contenders import contend
 from dejavu_torch.evaluation.localization import Localization
 from dejavu_torch.evaluation.pictures import draw_pictures, paper_pictures
 from dejavu_torch.evaluation.report import PICTURES
 from dejavu_torch.evaluation.template_plots import shown_chunk
+from dejavu_torch.places.positions import place_of
 from dejavu_torch.recognition.localizer import Matching
 from dejavu_torch.types import FrequencyLayer
 

@@ -43,7 +43,7 @@ def both(features, grid, preprocess=None):
 def test_inner_cells_of_hog_are_those_of_windows_alone(small_tiles, stride, bins):
     hog = HOG(orientations=5, block=1, bins=bins)
     grid = Grid(ground(), 48, stride)
-    assert len(grid.area.tiles) > 1
+    assert len(grid.layout.tiles) > 1
     together, alone = (one.view(len(grid), 6, 6, 5) for one in both(hog, grid))
     torch.testing.assert_close(together[:, 1:-1, 1:-1], alone[:, 1:-1, 1:-1], rtol=1e-4, atol=1e-4)
     assert not torch.allclose(together[:, 0], alone[:, 0], atol=1e-3)  # gradients reach over the border
@@ -93,13 +93,13 @@ def test_tiles_of_a_picture_are_described_alike_by_themselves(small_tiles):
     every = Windows.of(grid)
     assert every is not None
     whole = torch.cat([*sharing.batches(every)])
-    rows, columns = grid.area.tiles[0]
+    rows, columns = grid.layout.tiles[0]
     part = Windows.of(Part(grid, range(rows * columns, len(grid))))
     assert part is not None
     torch.testing.assert_close(torch.cat([*sharing.batches(part)]), whole[rows * columns :], **CLOSE)
     assert Windows.of(Part(grid, range(1, len(grid)))) is None  # no whole tile
     assert Windows.of(Part(grid, torch.arange(len(grid)))) is None
-    sample = Sample.of_area(grid.area)
+    sample = Sample.of_area(grid.layout)
     blocks = Windows.of(Blocks(grid, sample.frame, sample.sizes))
     assert blocks is not None
     torch.testing.assert_close(torch.cat([*sharing.batches(blocks)]), whole[sample.frame], **CLOSE)
@@ -117,10 +117,10 @@ def test_large_blocks_are_described_in_bands(monkeypatch):
     windows = Windows.of(grid)
     assert windows is not None
     whole = [*sharing.batches(windows)]
-    monkeypatch.setattr(shared, "WINDOWS", 3 * grid.area.columns)
+    monkeypatch.setattr(shared, "WINDOWS", 3 * grid.layout.columns)
     parts = [*sharing.batches(windows)]
     assert len(whole) == 1
-    assert max(map(len, parts)) == 3 * grid.area.columns
+    assert max(map(len, parts)) == 3 * grid.layout.columns
     torch.testing.assert_close(torch.cat(parts), whole[0], **CLOSE)
 
 

@@ -20,9 +20,7 @@ def test_a_map_file_tells_what_it_told(name, tmp_path):
     place_map, table = model.map, model.map.table
     every = torch.arange(facts["places"])
     queries = torch.randn(3, place_map.dimension, generator=torch.Generator().manual_seed(9))
-    torch.testing.assert_close(
-        place_map.scores(queries), torch.tensor(facts["scores"]), atol=1e-3, rtol=1e-3
-    )
+    torch.testing.assert_close(place_map.scores(queries), torch.tensor(facts["scores"]), atol=1e-3, rtol=1e-3)
     assert (place_map.places, table.frames) == (facts["places"], facts["frames"])
     assert table.frame_of(every).tolist() == facts["frame_of"]
     assert table.borders.tolist() == facts["borders"]

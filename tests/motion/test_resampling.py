@@ -9,11 +9,11 @@ from helpers import refused, template_model
 
 from dejavu_torch import DejaVu
 from dejavu_torch.data.arrays import ArrayTraverse
-from dejavu_torch.data.positions import place_of
 from dejavu_torch.data.traverse import frame_range
 from dejavu_torch.features.whitening import Whitening
 from dejavu_torch.maps.spectral import SpectralMapper
 from dejavu_torch.motion.resampling import ResampledTraverse
+from dejavu_torch.places.positions import place_of
 
 
 @pytest.fixture(scope="module")

@@ -334,14 +334,14 @@ MUTANTS = [
     ),
     Mutant(
         "Going back and forth adds no places.",
-        "dejavu_torch/data/positions.py",
+        "dejavu_torch/places/positions.py",
         "furthest = positions.cummax(0).values + NEAR",
         "furthest = positions + NEAR",
-        ("tests/data/test_positions.py::-k going_back or first_reached",),
+        ("tests/places/test_positions.py::-k going_back or first_reached",),
     ),
     Mutant(
         "A frame behind the first place shows none.",
-        "dejavu_torch/data/positions.py",
+        "dejavu_torch/places/positions.py",
         ".clamp(-1, count_places(positions) - 1)",
         ".clamp(0, count_places(positions) - 1)",
         ("tests/motion/test_resampling.py::test_the_way_back_belongs_to_the_places_it_passes",),
@@ -1034,7 +1034,7 @@ MUTANTS = [
     Mutant(
         "The filter of a comparison moves in the plane.",
         "dejavu_torch/recognition/localizer.py",
-        "T: one.over(self.area) if isinstance(one, PlaceFilter) else one",
+        "T: one.over(layout) if isinstance(one, PlaceFilter) else one",
         "T: one",
         ("tests/test_area.py::-k flight_on_the_way",),
     ),

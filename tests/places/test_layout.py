@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dejavu_torch.places import layout as layouts
-from dejavu_torch.places.layout import Layout, apart
+from dejavu_torch.places.layout import Layout, Rectangle
 
 sides = st.integers(1, 12)
 
@@ -37,7 +37,7 @@ def test_a_route_is_one_column(places, radius, k, seed):
 @given(rows=sides, columns=sides, radius=st.integers(0, 14), k=st.integers(1, 14))
 def test_near_is_the_same_for_all(rows, columns, radius, k):
     """Distance, surroundings, and what every k-th place is nearest to agree, also on a grown layout."""
-    grown = Layout.of([Layout(rows, columns), Layout(2, 3, corner=(rows, -1))])
+    grown = Layout.of([Rectangle(rows, columns), Rectangle(2, 3, corner=(rows, -1))])
     for layout in (Layout(rows, columns), grown):
         every = torch.arange(layout.places)
         far = layout.distance(every[:, None], every)
@@ -62,12 +62,12 @@ def test_a_stride_of_a_stride(rows, columns, one, other):
 @given(sizes=st.lists(st.tuples(sides, sides), min_size=2, max_size=3))
 def test_places_that_are_not_of_one_ground_are_never_near(sizes):
     each = [Layout(*size) for size in sizes]
-    joined, start = apart(each), 0
+    joined, start = Layout.merged(each, [[str(route)] for route in range(len(each))]), 0
     assert joined.places == sum(one.places for one in each)
     for one in each:
         own = torch.arange(start, start + one.places)
         others = torch.cat([torch.arange(start), torch.arange(start + one.places, joined.places)])
-        assert int(joined.distance(own[:, None], others).min()) > layouts.GAP
+        assert int(joined.distance(own[:, None], others).min()) >= layouts.FAR
         assert torch.equal(
             joined.distance(own[:, None], own), one.distance(own[:, None] - start, own - start)
         )

@@ -10,12 +10,13 @@ import torch.nn.functional as F
 from test_smoother import noise, shown
 
 from dejavu_torch.maps.spectral import SpectralMapper
+from dejavu_torch.places.states import States
 from dejavu_torch.recognition import drive as driving
 from dejavu_torch.recognition import large
 from dejavu_torch.recognition.drive import DriveQuery, localize_drive
 from dejavu_torch.recognition.large import LargeDrive, Tiles, is_large
 from dejavu_torch.recognition.localizer import Localizer, Matching
-from dejavu_torch.recognition.motion import Motion, Rates, States
+from dejavu_torch.recognition.motion import Motion, Rates
 from dejavu_torch.recognition.smoother import PlaceSmoother
 
 

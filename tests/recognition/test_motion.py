@@ -11,7 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from reference import Steps
 
-from dejavu_torch.recognition.motion import Motion, Rates, States, checked_rates
+from dejavu_torch.places.states import States
+from dejavu_torch.recognition.motion import Motion, Rates, checked_rates
 
 
 @st.composite

@@ -16,7 +16,6 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from dejavu_torch import area
 from dejavu_torch.data.grid import Grid
 from dejavu_torch.data.simulate.aerial import (
     ASPHALT,
@@ -33,6 +32,7 @@ from dejavu_torch.data.simulate.aerial import (
 )
 from dejavu_torch.data.simulate.route import Random, rgb
 from dejavu_torch.memory import check_room, in_float32, in_one_thread
+from dejavu_torch.places.layout import Ground
 from dejavu_torch.types import expect
 
 PIXELS = 4  # per metre
@@ -344,7 +344,7 @@ def open_terrain(
 
     Example:
         >>> ground = open_terrain(metres=32, stride=16)
-        >>> ground.frame_shape, ground.area.rows, ground.coordinates.values[0].tolist()
+        >>> ground.frame_shape, ground.layout.rows, ground.coordinates.values[0].tolist()
         ((3, 64, 64), 5, [8.0, 8.0])
     """
     name, side = f"sim:terrain?seed={seed}&traverse={traverse}&metres={metres}", PIXELS * metres
@@ -353,5 +353,5 @@ def open_terrain(
     name += f"&window={window}&stride={stride}"
     expect(1 <= stride <= window <= side, f"1 <= stride <= window <= {side} pixels", name)
     check_room(ROOM * side**2 + ROOM_OF_BLOCK, name)
-    where = area.Ground(unit="m", frame=f"sim:terrain?seed={seed}").scaled(1 / PIXELS, 1 / PIXELS)
+    where = Ground(unit="m", frame=f"sim:terrain?seed={seed}").scaled(1 / PIXELS, 1 / PIXELS)
     return Grid(paint_ground(seed, traverse, metres), window, stride, name=name, ground=where)

@@ -6,7 +6,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dejavu_torch.data.positions import NEAR, borders, place_of, shown_frames
+from dejavu_torch.places.positions import NEAR, borders, place_of, shown_frames
 
 WAYS = st.lists(st.floats(-1.5, 2.5, width=32), min_size=1, max_size=25).map(
     lambda steps: torch.tensor([0.0, *steps]).cumsum(0)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from dejavu_torch.types import expect
+from dejavu_torch.text import expect
 
 MAX_PLACES = 2**24  # a float32 holds every whole number up to here
 NEAR = 1e-4  # steps: a frame this close to a place has reached it
