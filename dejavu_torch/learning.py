@@ -206,9 +206,9 @@ def append_places(
     Raises:
         InputError: frames that cannot be read, or a full disk; finished chunks are kept.
     """
-    frames, settings = len(traverse), (place_map.transform, place_map.resolution)
-    route = int(place_map.layout.route_of(torch.tensor(start)))
-    encode = ChunkEncoder(traverse, descriptor, place_map.means[route], place_map.step, *settings, visits)
+    frames, route = len(traverse), int(place_map.layout.route_of(torch.tensor(start)))
+    coded = place_map.means[route], place_map.step_of(route), place_map.transform, place_map.resolution
+    encode = ChunkEncoder(traverse, descriptor, *coded, visits)
     done = range(place_map.places - start)
     sizes = (rows * columns for rows, columns in traverse.layout.sizes(place_map.chunk))
     bounds = pairwise(accumulate(sizes, initial=0))

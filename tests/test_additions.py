@@ -1,5 +1,5 @@
-"""What can be added from outside, each in at most 25 lines: a map (test_seam.py), a way to match, and later a
-layout, a baseline, a wrapper of scores and a motion."""
+"""What can be added from outside, each in at most 25 lines: a map (test_seam.py), a way, a layout, and later
+a baseline, a wrapper of scores and a motion."""
 
 from __future__ import annotations
 
@@ -8,8 +8,10 @@ import inspect
 import pytest
 import torch
 
-from dejavu_torch import DejaVu, SpectralMapper, compare
+from dejavu_torch import DejaVu, Layout, PlaceSmoother, SpectralMapper, compare
 from dejavu_torch.data.arrays import ArrayTraverse
+from dejavu_torch.evaluation.matches import read_matches, write_matches
+from dejavu_torch.places.layout import KINDS
 from dejavu_torch.types import SequenceModel
 
 LINES = 25
@@ -54,23 +56,38 @@ def test_a_way(tmp_path):
     assert torch.equal(one_by_one.index, found.run.match.index)
 
 
-@pytest.mark.xfail(raises=ImportError, strict=True)
-def test_a_layout():
-    from dejavu_torch.places import Layout
+class Ring(Layout):
+    """Places around a square, whose last is beside the first."""
 
-    class Ring(Layout):
-        """Places around a square, whose last is beside the first."""
+    def distance(self, one, other):
+        far = (one - other).abs()
+        return torch.minimum(far, self.places - far)
 
-        def apart(self, one, other):
-            far = (one - other).abs()
-            return torch.minimum(far, self.places - far)
+    def neighbours(self, places, radius):
+        return (places[:, None] + torch.arange(-radius, radius + 1)) % self.places
 
-    seen = waves(1)
-    found = compare(waves(0), seen, "0", model(), layout=Ring(120), top=3, tolerance=5)
-    best = found.candidates.index
-    gaps = (best[:, :, None] - best[:, None]).abs()
-    assert int(torch.minimum(gaps, 120 - gaps)[:, ~torch.eye(3, dtype=torch.bool)].min()) > 5
+    @property
+    def joins(self):
+        return ((self.places - 1, 0, 1.0),)
+
+
+def test_a_layout(tmp_path, monkeypatch):
+    monkeypatch.setitem(KINDS, "Ring", Ring)  # that files may name
+    square, seen = waves(0), waves(1)
+    square.layout = Ring(120)
+    found = compare(square, seen, "0", model(), top=3, tolerance=5, sequence=None)
     assert found.report.as_json()["recall_at_1"] > 0.95
+    model().learn(square).save(tmp_path / "map.safetensors")
+    loaded = DejaVu.load(tmp_path / "map.safetensors")
+    assert loaded.map.layout == Ring(120)
+    matches = loaded.candidates(seen, 3, sequence=None)
+    assert torch.equal(matches.index, found.candidates.index[:, :3])
+    apart = loaded.map.layout.distance(matches.index[:, :, None], matches.index[:, None])
+    assert int(apart[:, ~torch.eye(3, dtype=torch.bool)].min()) > 5
+    write_matches(tmp_path / "matches.csv", [matches.map(torch.flatten)], None, loaded.map.table, ranks=3)
+    assert torch.equal(read_matches(tmp_path / "matches.csv").candidates, matches.index)
+    rounds = torch.cat([seen[90:], seen[:30]])  # a drive through the seam
+    assert loaded.localize(rounds, sequence=PlaceSmoother()).index.tolist() == [*range(90, 120), *range(30)]
 
 
 @pytest.mark.xfail(raises=ImportError, strict=True)
@@ -122,7 +139,9 @@ def test_a_motion():
     assert torch.equal(match.index, torch.arange(0, 120, 2))
 
 
-@pytest.mark.parametrize("added", [Doubled, test_a_layout, test_a_baseline, test_a_wrapper, test_a_motion])
+@pytest.mark.parametrize(
+    "added", [Doubled, Ring, test_a_layout, test_a_baseline, test_a_wrapper, test_a_motion]
+)
 def test_an_addition_is_short(added):
     lines = [line for line in inspect.getsource(added).splitlines() if line.strip()]
     assert len(lines) <= LINES

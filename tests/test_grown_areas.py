@@ -168,6 +168,27 @@ def test_areas_are_merged_like_routes(picture, small_tiles, tmp_path):
     assert merge([grown, right], ["grown", "right"]).map.part("grown").area == grown.map.area
 
 
+def test_one_of_merged_areas_grows_and_keeps_its_metres(picture, small_tiles, tmp_path):
+    left, right = learn(picture(columns="0:128")), learn(picture(columns="128:240"))
+    more = open_source(picture(columns="96:240"))
+    alone, merged = append(learn(picture(columns="0:128")), more), merge([left, right], ["left", "right"])
+    before = merged.map.layout.coordinates(torch.arange(merged.map.places))
+    append(merged, more, route="left").save(tmp_path / "grown.safetensors")
+    grown = DejaVu.load(tmp_path / "grown.safetensors")
+    layout = grown.map.layout
+    assert torch.equal(layout.coordinates(torch.arange(len(before))), before)
+    assert layout.only(0) == alone.map.layout
+    own = layout.places_in(0)
+    assert torch.equal(layout.coordinates(own), alone.map.layout.coordinates(torch.arange(len(own))))
+    queries = grown.descriptor.all_of(open_source(picture()))
+    expected = alone.map.scores(queries)
+    torch.testing.assert_close(grown.map.scores(queries)[:, own], expected, rtol=1e-4, atol=1e-5)
+    assert grown.map.part("left").layout == alone.map.layout
+    with refused("share 13 x 6 windows"):
+        append(merged, open_source(picture(columns="0:128")), route="left")
+    assert append(merged, open_source(picture(columns="0:128")), route="right").map.layout.count == 2
+
+
 def test_each_of_merged_areas_has_its_own_mean(small_tiles):
     rows = torch.rand(2, 36, 8, generator=torch.Generator().manual_seed(0)) + torch.tensor([0.0, 2.0]).view(
         2, 1, 1

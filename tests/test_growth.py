@@ -35,6 +35,8 @@ from dejavu_torch.places.frame_table import FrameTable
 from dejavu_torch.places.layout import Layout, Rectangle
 from dejavu_torch.places.positions import count_places, positions_behind, shown_frames
 from dejavu_torch.recognition.calibration import Calibration, Platt
+from dejavu_torch.recognition.localizer import Matching
+from dejavu_torch.recognition.smoother import PlaceSmoother
 
 NUMBERS = 6
 
@@ -278,6 +280,66 @@ def test_a_place_of_a_merged_map_has_a_route_and_a_frame():
     assert all(map(torch.equal, part.packed().values(), own.packed().values()))
     with refused("no route 'd'", "a, b, c"):
         merged.map.part("d")  # type: ignore[operator]
+
+
+def test_one_route_of_a_merged_map_goes_on_and_no_place_gets_another_number(tmp_path):
+    """As if it had gone on before it was merged; only its new places are the last ones."""
+    long = [walk(100 + 30 * i + 60, seed=i) + i for i in range(3)]
+    models = routes("a", "b", "c")
+    merged, rest = merge(models, ["a", "b", "c"]), Named(long[0][100:160], "more")
+    linked = merged.map.linked([(99, 100, 0.5)])  # type: ignore[operator]
+    merged.replace_map(linked)
+    queries = merged.descriptor.whitened(torch.cat(long))
+    before, alone = merged.map.scores(queries), append(models[0], rest).map
+    grown = append(merged, rest, route="a")
+    grown.save(tmp_path / "grown.safetensors")
+    for model in (grown, DejaVu.load(tmp_path / "grown.safetensors")):
+        place_map, table = spectral(model), model.map.table
+        torch.testing.assert_close(place_map.scores(queries)[:, :390], before, atol=1e-6, rtol=1e-4)
+        own = torch.cat([torch.arange(100), torch.arange(390, 450)])
+        expected = alone.scores(queries)
+        torch.testing.assert_close(place_map.scores(queries)[:, own], expected, atol=1e-6, rtol=1e-4)
+        assert place_map.routes == (("a", 160, 160), ("b", 130, 130), ("c", 160, 160))
+        assert table.route_of(own).tolist() == [0] * 160
+        assert table.own_frame_of(own).tolist() == [*range(160)]
+        assert model.frame_names[390] == "more_0000.png"
+        assert place_map.connections == ((99, 100, 0.5), (99, 390, 1.0))
+        part = place_map.part("a")
+        assert all(map(torch.equal, part.packed().values(), alone.packed().values()))
+        assert part.layout == alone.layout
+        # a drive crosses the border, and an answer on one side of it suppresses those on the other
+        drive = model.localize_descriptors(model.descriptor.whitened(long[0][70:130]), PlaceSmoother())
+        assert float((drive.index == own[70:130]).double().mean()) > 0.9
+        two = model.localize_descriptors(queries[95:105], Matching(k=2, radius=5)).index
+        assert int(place_map.layout.distance(*two.T).min()) > 5
+    more = append(append(grown, walk(20, seed=7), route="a"), walk(20, seed=8), route="c")
+    assert [len(part) for part in more.map.layout.ranges(0)] == [100, 80]
+    assert [len(part) for part in more.map.layout.ranges(2)] == [160, 20]
+    both = merge([more, models[1]], ["all", "b"])
+    assert both.map.layout.routes == ("a", "b", "c", "b-2")
+    assert both.map.layout.starts == (0, 100, 230, 390, 470, 490)
+    assert both.map.connections[0] == (99, 100, 0.5)
+    with refused("no route 'd'", "a, b, c"):
+        append(grown, rest, route="d")
+    assert only_route(grown, "a").frame_names[99:101] == ["a_0099.png", "more_0000.png"]
+
+
+def test_a_merged_route_of_even_steps_goes_on():
+    parts = footage(REFERENCE), footage(REFERENCE[:70]).flip(3)
+    models = [on_ground(ground) for ground in parts]
+    merged, rest = merge(models, ["out", "back"]), ArrayTraverse(footage(REFERENCE + 31), "next")
+    before = merged.map.frame_of(torch.arange(merged.map.places))
+    grown, alone = append(merged, rest, route="out"), append(models[0], rest)
+    assert torch.equal(grown.map.frame_of(torch.arange(len(before))), before)
+    own = grown.map.layout.places_in(0)
+    shown = grown.map.table.own_frame_of(own)
+    assert int((shown - alone.map.frame_of(torch.arange(202))).abs().max()) <= 1
+    assert torch.allclose(grown.map.part("out").positions, alone.map.positions, atol=1e-3)
+    longer = append(append(grown, rest, route="out"), rest, route="back").map
+    frames = len(REFERENCE)
+    sizes = [(303, 3 * frames), (models[1].map.places + 101, 70 + frames)]
+    assert [route[1:] for route in longer.routes] == sizes
+    assert torch.equal(longer.place_of(longer.frame_of(own)), grown.map.place_of(grown.map.frame_of(own)))
 
 
 def test_even_steps_of_merged_routes():

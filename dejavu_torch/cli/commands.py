@@ -107,7 +107,7 @@ def run_learn(
             traverse, places = visits.traverse, visits.places
             done = f"{count} of the {start} places of {append}: averaged and coded again at the same step"
         elif append is not None:
-            growth.append(model, traverse, True, checkpoint, map_tasks, visits)
+            growth.append(model, traverse, True, checkpoint, map_tasks, visits, growing.route)
             places = torch.arange(start, model.map.places)
             if isinstance(known, LabelledFrames):
                 known = known._replace(places=known.places + torch.where(known.places >= 0, start, 0))

@@ -340,11 +340,13 @@ class GrowthOptions:
         average: another visit, to average into the places of the source before they are coded; without a
             source, into those of --append, which are decoded, averaged and coded again with the same step
         average_truth: ground truth of --average, in the formats of --truth of `dejavu compare`
+        route: the route of a merged map that --append makes longer
     """
 
     append: Path | None = None
     average: str | None = None
     average_truth: str | None = None
+    route: str | None = None
 
     def model(self, given: DejaVu) -> DejaVu:
         """The model of --append with the features and acceptance of the given one, else the given one."""
@@ -355,7 +357,8 @@ class GrowthOptions:
         return model
 
     def check(self, sources: Iterable[str], calibration: str | None) -> None:
-        """Refuse to average a traverse with itself, or to calibrate by the averaged one."""
+        """Refuse to average a traverse with itself, to calibrate by the averaged one, or a route alone."""
+        expect(self.route is None or self.append, "--append with a merged map", f"--route {self.route}")
         if self.average is None:
             check_no_truth("average", self.average_truth)
             return

@@ -250,7 +250,7 @@ class SpectralMap(PlaceMap):
 
     def _routes_of(self, chunks: range) -> Tensor:
         """The route of each chunk."""
-        starts = torch.tensor([self.chunks[g][0] for g in chunks], device=self.device)
+        starts = torch.tensor([self.chunks[g][0] for g in chunks], dtype=torch.int64, device=self.device)
         return self.layout.route_of(starts)
 
     def coded(self) -> list[Chunk]:
@@ -410,6 +410,11 @@ class SpectralMap(PlaceMap):
     def step(self) -> float:
         """Of the last chunk, and of the next."""
         return float(self.steps[-1]) if len(self.steps) else self._step
+
+    def step_of(self, route: int) -> float:
+        """Of the last chunk of a route, and of its next."""
+        own = (self._routes_of(range(len(self.chunks))) == route).nonzero()[:, 0]
+        return float(self.steps[own[-1]]) if len(own) else self.step
 
     def lines(self, chunk: int) -> Lines:
         """The coefficients of a chunk, by line and feature."""

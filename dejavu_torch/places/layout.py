@@ -437,29 +437,32 @@ class Layout:
 
     def mass_near(self, mass: Tensor, places: Tensor, radius: int) -> Tensor:
         """The mass of places (Q,) and of those up to a radius, (Q,N) -> (Q,)."""
-        if self.dimensions == 2:
-            sums = self.by_place(boxes(self.as_plane(mass), radius)).clamp(0, 1)
-            return sums.gather(1, places[:, None])[:, 0]
-        near = self.neighbours(places, min(radius, self.places))
-        return (mass.gather(1, near.clamp(min=0)) * (near >= 0)).sum(1).clamp(0, 1)
+        if self.dimensions == 1:
+            near = self.neighbours(places, min(radius, self.places))
+            return (mass.gather(1, near.clamp(min=0)) * (near >= 0)).sum(1).clamp(0, 1)
+        if self.count > 1:
+            routes = self.route_of(torch.arange(self.places, device=mass.device))
+            mass = mass * (routes == self.route_of(places)[:, None])
+        sums = self.by_place(boxes(self.as_plane(mass), radius)).clamp(0, 1)
+        return sums.gather(1, places[:, None])[:, 0]
 
     def blurred(self, mass: Tensor, radius: int) -> Tensor:
         """The mass of each place and those up to a radius, with weights that fall with the distance: a
         triangle along a route, a pyramid over an area, (Q,N) -> (Q,N)."""
         if not radius:
             return mass
-        if self.dimensions == 2:
-            half = max(1, radius // 2)  # two boxes make a pyramid, whole also at a border
-            padded = F.pad(self.as_plane(mass), 4 * (half,))
-            pyramid = boxes(boxes(padded, half), half)[:, half:-half, half:-half]
-            return self.by_place(pyramid / (2 * half + 1) ** 2).clamp(0, 1)
         if self._plain:
             return triangles(mass, radius)
-        order = self._orders()[0].to(mass.device)
-        order = order[order < self.places]  # route after route
-        sizes = [self.places_of(route) for route in range(self.count)]
-        parts = [triangles(part, radius) for part in mass[:, order].split(sizes, 1)]
-        return torch.cat(parts, 1)[:, order.argsort()]
+        if self.count > 1:
+            found = torch.empty_like(mass)
+            for route in range(self.count):
+                own = self.places_in(route).to(mass.device)
+                found[:, own] = self.only(route).blurred(mass[:, own], radius)
+            return found
+        half = max(1, radius // 2)  # two boxes make a pyramid, whole also at a border
+        padded = F.pad(self.as_plane(mass), 4 * (half,))
+        pyramid = boxes(boxes(padded, half), half)[:, half:-half, half:-half]
+        return self.by_place(pyramid / (2 * half + 1) ** 2).clamp(0, 1)
 
     def strided(self, k: int) -> tuple[Tensor, Tensor]:
         """Every k-th place in each direction, (n,), and of each place which of these is nearest, (N,), int64.
@@ -471,7 +474,7 @@ class Layout:
         if len(self.rectangles) > 1:
             kept, nearest, count = list[Tensor](), list[Tensor](), 0
             for one, start in zip(self.rectangles, self._firsts, strict=True):
-                stored, near = Layout.of([one]).strided(k)
+                stored, near = self._alone(one).strided(k)
                 kept.append(stored + start)
                 nearest.append(near + count)
                 count += len(stored)
@@ -516,6 +519,10 @@ class Layout:
 
     # ------------------------------------------------------------------ on the ground
 
+    def _alone(self, one: Rectangle) -> Layout:
+        """One rectangle by itself."""
+        return Layout.of([one._replace(route=0)], self.unit)
+
     @property
     def _firsts(self) -> list[int]:
         """The first place of each rectangle."""
@@ -538,7 +545,7 @@ class Layout:
         """The places whose middles are nearest to (x, y), (n,2) -> (n,); -1 for over half a step away."""
         found = torch.full((len(points),), -1)
         for one, start, cells in self._among(points):
-            place = Layout.of([one]).place_at(cells.nan_to_num(-1).round().long())
+            place = self._alone(one).place_at(cells.nan_to_num(-1).round().long())
             found = torch.where(place >= 0, start + place, found)
         return found
 
@@ -554,7 +561,7 @@ class Layout:
         """The windows whose middles are at most so far from (x, y), (n,2) -> (n,M) int64, -1 as padding."""
         found = [torch.full((len(points), 1), -1)]
         for one, start, cells in self._among(points):
-            alone = Layout.of([one])
+            alone = self._alone(one)
             last = cells.new_tensor([one.rows - 1, one.columns - 1])
             nearest = cells.nan_to_num(-1).clamp(torch.zeros_like(last), last).round().long()
             reach = 1 + math.ceil(distance / min(math.hypot(*one.down), math.hypot(*one.right)))

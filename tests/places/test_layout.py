@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import json
+from itertools import pairwise
+
 import pytest
 import torch
 from hypothesis import given
@@ -57,6 +60,88 @@ def test_a_stride_of_a_stride(rows, columns, one, other):
     kept = Layout(-(-rows // one), -(-columns // one))
     cells = kept.cells(kept.strided(other)[0])
     assert torch.equal(whole.place_at(cells * one), whole.strided(one * other)[0])
+
+
+@st.composite
+def layouts_of_all_kinds(draw):
+    """Routes, areas, and several of them that have grown in any order."""
+    columns = st.just(1) if draw(st.booleans()) else sides
+    unit = draw(st.sampled_from(["px", "m"])) if columns is sides else ""
+    parts, down = [], {"right": (2.0, 0.0), "down": (0.0, 3.0)} if unit else {}
+    for _ in range(draw(st.integers(1, 3))):
+        parts.append(Layout(draw(sides), draw(columns), **down, unit=unit))
+    layout = parts[0] if len(parts) == 1 else Layout.merged(parts, [[str(i)] for i in range(len(parts))])
+    for route in draw(st.lists(st.integers(0, len(parts) - 1), max_size=3)):
+        own = [one for one in layout.rectangles if one.route == route]
+        below = max(one.corner[0] + one.rows for one in own) * 3.0
+        more = Layout(draw(sides), own[0].columns, (0.0, below), **down, unit=unit)
+        layout = layout.grown(more, "more", route=route)
+    return layout
+
+
+@given(layout=layouts_of_all_kinds(), radius=st.integers(0, 40), k=st.integers(1, 9))
+def test_places_of_one_route_are_near_by_rows_and_columns_and_no_others(layout, radius, k):
+    every = torch.arange(layout.places)
+    route, far = layout.route_of(every), layout.distance(every[:, None], every)
+    alike = route[:, None] == route
+    assert bool((far[~alike] >= layouts.FAR).all())
+    cells = layout.cells(every)
+    assert torch.equal(far[alike], (cells[:, None] - cells).abs().amax(2)[alike])
+    assert torch.equal(layout.place_at(cells), every)
+    for place, near in zip(every, layout.around(every, radius).tolist(), strict=True):
+        assert {*near} == {*(far[place] <= radius).nonzero()[:, 0].tolist()}
+    mass = torch.rand(3, layout.places, dtype=torch.float64, generator=torch.Generator().manual_seed(radius))
+    mass /= mass.sum(1, keepdim=True)
+    at = every[torch.arange(3) * len(every) // 3]
+    torch.testing.assert_close(layout.mass_near(mass, at, radius), (mass * (far[at] <= radius)).sum(1))
+    even = 2 * (radius // 2)  # a triangle, or pyramid
+    away = (cells[:, None] - cells).abs() / (even + 1)
+    weight = ((1 - away).clamp(min=0).prod(2) * alike).double()
+    torch.testing.assert_close(layout.blurred(mass, even), mass @ weight)
+    # places of each route by itself are as far from each other as before
+    for r in range(layout.count):
+        own, alone = layout.places_in(r), layout.only(r)
+        inside = torch.arange(alone.places)
+        assert torch.equal(alone.distance(inside[:, None], inside), far[own][:, own])
+        torch.testing.assert_close(alone.coordinates(inside), layout.coordinates(own), equal_nan=True)
+    stored, nearest = layout.strided(k)
+    assert torch.equal(route[stored][nearest], route)
+    assert int(far[every, stored[nearest]].max()) < k
+    assert (
+        Layout.restored(json.loads(json.dumps(layout.stored())), layout.places).reaching(len(every)) == layout
+    )
+
+
+@given(layout=layouts_of_all_kinds(), start=st.integers(0, 30), length=st.integers(1, 30))
+def test_numbers_never_change_and_a_camera_goes_on_from_part_to_part(layout, start, length):
+    if layout.dimensions == 2:
+        assert layout.joins == ()
+        return
+    states, every = layout.states(2, [(0, 0, 0.5)]), torch.arange(layout.places)
+    assert (states.places, states.directions, states.links[0]) == (layout.places, 2, (0, 0, 0.5))
+    follows = {(int(a), int(b)) for r in range(layout.count) for a, b in pairwise(layout.places_in(r))}
+    plain = {(a, a + 1) for a in every[:-1].tolist() if a + 1 not in states.route_starts}
+    assert follows == plain | {(a, b) for a, b, share in layout.joins if share == 1.0}
+    grown = layout.grown(Layout(5), "more", route=layout.count - 1)
+    before = layout.distance(every[:, None], every)
+    assert torch.equal(grown.distance(every[:, None], every), before)
+    stop = min(layout.places, start + length)
+    if start < stop:  # some chunks of a map, as a worker holds them
+        part, some = layout.cut(start, stop), every[: stop - start]
+        same = layout.route_of(some + start)
+        named = [layout.names("")[r] for r in same.tolist()]
+        assert [part.names("")[r] for r in part.route_of(some).tolist()] == named
+
+
+@given(layout=layouts_of_all_kinds(), distance=st.floats(0.5, 30), seed=st.integers(0, 99))
+def test_places_within_a_distance_are_those_by_their_coordinates(layout, distance, seed):
+    draw = torch.Generator().manual_seed(seed)
+    points = 60 * torch.rand(5, 2, dtype=torch.float64, generator=draw) - 10
+    points[0] = torch.nan
+    found = layout.within(points, distance)
+    away = (layout.coordinates(torch.arange(layout.places)) - points[:, None]).norm(dim=2)
+    for near, row in zip(found.tolist(), away, strict=True):
+        assert {*near} - {-1} == {*(row <= distance).nonzero()[:, 0].tolist()}
 
 
 @given(sizes=st.lists(st.tuples(sides, sides), min_size=2, max_size=3))
