@@ -120,8 +120,8 @@ MUTANTS = [
         "Two candidates of a query are more than `radius` places from each other, to both sides of the "
         "better one.",
         "dejavu_torch/places/layout.py",
-        "(places[:, None] + offset).clamp(0, self.rows - 1)",
-        "(places[:, None] + offset[:-1]).clamp(0, self.rows - 1)",
+        "            near = places[:, None] + offset\n",
+        "            near = places[:, None] + offset[:-1]\n",
         ("tests/recognition/test_select.py::test_candidates_equal_reference",),
     ),
     Mutant(
@@ -336,7 +336,7 @@ MUTANTS = [
     Mutant(
         "A live answer on a merged map gives the frame as counted on its own route.",
         "dejavu_torch/live/localizer.py",
-        "frame=int(table.own_frame_of(match.index)) if routes else shown,",
+        "frame=int(table.own_frame_of(match.index)),",
         "frame=shown,",
         ("tests/test_cli_growth.py::test_live_names_the_route",),
     ),

@@ -201,9 +201,9 @@ MUTANTS = [
     ),
     Mutant(
         "A filter's score of a place counts its neighbours up to `within` places away.",
-        "dejavu_torch/recognition/filter.py",
-        "side = within + 1  # two",
-        "within, side = within // 2 * 2, within // 2 * 2 + 1  # two",
+        "dejavu_torch/places/layout.py",
+        "radius = min(radius, mass.shape[1])",
+        "radius = min(radius, mass.shape[1]) // 2 * 2",
         ("tests/test_behaviour.py::test_a_filter_counts_neighbours_up_to_within",),
     ),
     Mutant(
@@ -372,8 +372,8 @@ MUTANTS = [
     Mutant(
         "Of routes of one name that are merged, each further one gets a number.",
         "dejavu_torch/growth.py",
-        "parts[free_name(wanted, parts)] = part",
-        "parts[wanted] = part",
+        "routes[-1].append(free_name(wanted, taken))",
+        "routes[-1].append(wanted)",
         ("tests/test_growth.py::test_merging_merged_maps_and_names_that_are_there",),
     ),
     Mutant(
@@ -480,9 +480,9 @@ MUTANTS = [
     ),
     Mutant(
         "The borders of routes that a sequence keeps are those of the places, through all routes.",
-        "dejavu_torch/maps/place_map.py",
-        "accumulate(route.places for route in self.routes[:-1])",
-        "(route.places for route in self.routes[:-1])",
+        "dejavu_torch/places/layout.py",
+        "(*accumulate((run.places for run in self.runs[:-1]), initial=0),)",
+        "(0, *(run.places for run in self.runs[:-1]))",
         ("tests/test_growth.py::test_a_sequence_does_not_run_from_one_route_into_the_next",),
     ),
     Mutant(
@@ -495,8 +495,8 @@ MUTANTS = [
     Mutant(
         "Some chunks of a map, as a worker holds them, score as in the whole: with the mean of their route.",
         "dejavu_torch/maps/spectral_map.py",
-        "part = self._without_places(self.means[unique])",
-        "part = SpectralMap(self.means[unique * 0], **self.settings())",
+        "part = self._without_places(self.means[self._routes_of(range(first, last)).unique()])",
+        "part = self._without_places(self.means[self._routes_of(range(first, last)).unique() * 0])",
         ("tests/test_cluster.py::test_a_part_scores_as_in_the_whole_map",),
     ),
     Mutant(
@@ -957,14 +957,14 @@ MUTANTS = [
     Mutant(
         "Candidates in an area are apart in rows and columns.",
         "dejavu_torch/places/layout.py",
-        "        if self.dimensions == 1:\n            return (places[:, None] + offset)",
-        "        if True:\n            return (places[:, None] + offset)",
+        "        if self._plain:\n            near = places[:, None] + offset",
+        "        if True:\n            near = places[:, None] + offset",
         ("tests/test_area.py::-k candidates_are_apart",),
     ),
     Mutant(
         "The tiles of a long area are coded in both directions.",
         "dejavu_torch/learning.py",
-        "columns = 1 if area is None else area.columns_from(frames.start)",
+        "columns = self.traverse.layout.columns_from(frames.start)",
         "columns = 1",
         ("tests/test_area.py::-k tile_by_tile",),
     ),
@@ -1005,9 +1005,9 @@ MUTANTS = [
     ),
     Mutant(
         "A window at a border is chosen by its own mass.",
-        "dejavu_torch/recognition/plane.py",
-        "F.pad(plane, 4 * (half,)), half), half)[:, half:-half, half:-half]",
-        "plane, half), half)",
+        "dejavu_torch/places/layout.py",
+        "boxes(boxes(padded, half), half)[:, half:-half, half:-half]",
+        "boxes(boxes(self.as_plane(mass), half), half)",
         ("tests/test_area.py::-k chosen_by_its_own_mass",),
     ),
     Mutant(
@@ -1020,13 +1020,48 @@ MUTANTS = [
     Mutant(
         "Coordinates of areas are compared in double precision.",
         "dejavu_torch/places/layout.py",
-        "torch.tensor([part.first, part.down, part.right], dtype=torch.float64)",
-        "torch.tensor([part.first, part.down, part.right]).double()",
+        "torch.tensor([one.first, one.down, one.right], dtype=torch.float64)",
+        "torch.tensor([one.first, one.down, one.right]).double()",
         ("tests/test_grown_areas.py::-k exact",),
     ),
     Mutant(
+        "The mass near a place is that of its own route.",
+        "dejavu_torch/places/layout.py",
+        "mass = mass * (routes == self.route_of(places)[:, None])",
+        "pass",
+        ("tests/places/test_layout.py::-k no_others",),
+    ),
+    Mutant(
+        "Places of different routes are never near.",
+        "dejavu_torch/places/layout.py",
+        "return apart + FAR * (self.route_of(one) != self.route_of(other))",
+        "return apart",
+        ("tests/places/test_layout.py::-k no_others",),
+    ),
+    Mutant(
+        "A camera goes on from a part of a route to the next.",
+        "dejavu_torch/maps/place_map.py",
+        "return self.layout.joins",
+        "return ()",
+        ("tests/test_growth.py::-k no_place_gets_another_number",),
+    ),
+    Mutant(
+        "Places appended to a route of a merged map are coded with its step.",
+        "dejavu_torch/learning.py",
+        "place_map.step_of(route)",
+        "place_map.step",
+        ("tests/test_growth.py::-k no_place_gets_another_number",),
+    ),
+    Mutant(
+        "A frame of a route is counted through all of its parts.",
+        "dejavu_torch/places/frame_table.py",
+        "shifts.append(first - own[run.route])",
+        "shifts.append(first)",
+        ("tests/test_growth.py::-k no_place_gets_another_number",),
+    ),
+    Mutant(
         "Windows of two parts of an area do not share a place.",
-        "dejavu_torch/growth.py",
+        "dejavu_torch/places/layout.py",
         'expect(min(tall, wide) <= 0, "ground that the map lacks", seen)',
         "pass",
         ("tests/test_grown_areas.py::-k does_not_fit",),
