@@ -660,7 +660,7 @@ def _state_of(model: DejaVu, place_map: PlaceMap, traverse: Traverse | None) -> 
         log.warning(line, place_map.dimension)
     if len(shape) == 1 and (model.preprocess.channel or model.preprocess.contrast):
         log.warning("these are ready features: channel and contrast have no effect")
-    if isinstance(place_map, SpectralMap) and place_map.layout.has_north and len(shape) == 3:
+    if isinstance(place_map, SpectralMap) and place_map.layout.on_ground and len(shape) == 3:
         learning.turn_windows(place_map, model.descriptor, traverse)
     if len(positions):
         place_map.positions = positions.to(place_map.device)

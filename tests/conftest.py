@@ -16,7 +16,7 @@ from PIL import Image
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
-import dejavu_torch.places.layout as areas
+import dejavu_torch.places.rectangles as areas
 from dejavu_torch.data.simulate.route import SimulatedRoute
 from dejavu_torch.features import distilled
 from dejavu_torch.maps import compiling

@@ -15,7 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
-import dejavu_torch.places.layout as areas
+import dejavu_torch.places.rectangles as areas
 from dejavu_torch import (
     DejaVu,
     PlaceFilter,
@@ -32,7 +32,8 @@ from dejavu_torch.evaluation.baselines import stored_frames
 from dejavu_torch.features.views import Sample
 from dejavu_torch.maps.spectral_map import SpectralMap
 from dejavu_torch.maps.spectrum import by_frequency, frequencies, from_lines, lines_of
-from dejavu_torch.places.layout import Layout, Rectangle
+from dejavu_torch.places.layout import Layout
+from dejavu_torch.places.rectangles import Rectangle
 from dejavu_torch.recognition import flight as flights
 from dejavu_torch.recognition.coarse import CoarseSearch, SamplingPlan
 from dejavu_torch.recognition.evidence import RankTable, standardised

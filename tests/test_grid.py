@@ -30,7 +30,7 @@ from dejavu_torch.data.grid import Grid
 from dejavu_torch.data.ground_truth import find_ground_truth
 from dejavu_torch.data.picture import Picture, read_picture
 from dejavu_torch.data.source import check_not_read
-from dejavu_torch.places.layout import Ground
+from dejavu_torch.places.rectangles import Ground
 from dejavu_torch.resize import resize_frames
 from dejavu_torch.types import Coordinates
 

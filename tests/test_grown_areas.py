@@ -13,11 +13,12 @@ from hypothesis import strategies as st
 from PIL import Image
 from test_area import ground
 
-import dejavu_torch.places.layout as areas
+import dejavu_torch.places.rectangles as areas
 from dejavu_torch import DejaVu, PlaceFilter, PlaceSmoother, SpectralMapper, open_source
 from dejavu_torch.growth import append, associate, average, merge
 from dejavu_torch.maps.spectral_map import SpectralMap
-from dejavu_torch.places.layout import Layout, Rectangle
+from dejavu_torch.places.layout import FAR, Layout
+from dejavu_torch.places.rectangles import Rectangle
 
 WINDOWS = "window=48&stride=16"
 
@@ -87,7 +88,7 @@ def test_areas_that_are_apart_are_not_near():
     one, two = Layout(4, 5, first=(7.0, 8.0)), Layout.of([Rectangle(2, 3), Rectangle(2, 2, corner=(2, 0))])
     both = Layout.merged([one, two, one], [["a"], ["b"], ["c"]])
     assert both.places == 2 * one.places + two.places
-    assert int(both.distance(torch.tensor(19), torch.tensor(20))) >= areas.FAR
+    assert int(both.distance(torch.tensor(19), torch.tensor(20))) >= FAR
     assert [both.only(route) for route in range(3)] == [one, two, one]
     assert torch.equal(both.coordinates(torch.arange(30, 50)), one.coordinates(torch.arange(20)))
 

@@ -32,8 +32,9 @@ from dejavu_torch.maps.file import read_map
 from dejavu_torch.maps.spectral import encode_chunk
 from dejavu_torch.maps.spectral_map import SpectralMap
 from dejavu_torch.places.frame_table import FrameTable
-from dejavu_torch.places.layout import Layout, Rectangle
+from dejavu_torch.places.layout import Layout
 from dejavu_torch.places.positions import count_places, positions_behind, shown_frames
+from dejavu_torch.places.rectangles import Rectangle
 from dejavu_torch.recognition.calibration import Calibration, Platt
 from dejavu_torch.recognition.localizer import Matching
 from dejavu_torch.recognition.smoother import PlaceSmoother

@@ -12,7 +12,7 @@ from torch.nn.functional import grid_sample, normalize
 from dejavu_torch.data.files import as_number, read_rows
 from dejavu_torch.data.grid import BYTES, PIXELS
 from dejavu_torch.data.picture import Pixels, read_picture
-from dejavu_torch.places.layout import Ground
+from dejavu_torch.places.rectangles import Ground
 from dejavu_torch.text import printable
 from dejavu_torch.types import Coordinates, InputError, Traverse, expect
 

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from dejavu_torch.data.files import reading
 from dejavu_torch.data.folder import as_bytes
-from dejavu_torch.places.layout import Ground
+from dejavu_torch.places.rectangles import Ground
 from dejavu_torch.text import one_line
 from dejavu_torch.types import Facts, InputError, expect
 

@@ -9,7 +9,8 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from dejavu_torch.data.picture import Pixels, read_picture
-from dejavu_torch.places.layout import Ground, Layout
+from dejavu_torch.places.layout import Layout
+from dejavu_torch.places.rectangles import Ground
 from dejavu_torch.text import printable
 from dejavu_torch.types import Coordinates, Traverse, expect
 

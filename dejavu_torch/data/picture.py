@@ -20,7 +20,7 @@ from dejavu_torch.data.files import as_number, reading
 from dejavu_torch.data.folder import as_bytes, formats
 from dejavu_torch.data.geotiff import GeoTiff, has_rasterio
 from dejavu_torch.memory import check_room, without_autocast
-from dejavu_torch.places.layout import Ground
+from dejavu_torch.places.rectangles import Ground
 from dejavu_torch.text import printable
 from dejavu_torch.types import Facts, InputError
 

@@ -59,6 +59,6 @@ def facing_north(traverse: Traverse, layout: Layout, headings: int = 1) -> Trave
         expect(len(traverse.frame_shape) == 3, "images, which can be turned", seen)
         evenly = (torch.arange(headings) * 360 / headings).repeat(len(traverse))
         return Turned(traverse, evenly, headings)
-    if traverse.headings is None or len(traverse.frame_shape) != 3 or not layout.has_north:
+    if traverse.headings is None or len(traverse.frame_shape) != 3 or not layout.on_ground:
         return traverse
     return Turned(traverse, traverse.headings + layout.north)

@@ -101,9 +101,9 @@ def evaluate_file(
     parsed = None if truth is None else check_ground_truth(truth, interpolate)
     place_map = None if map is None else _map_of(map, route)
     layout = ROUTE if place_map is None else place_map.layout
-    if layout.has_north and reference is None:
+    if layout.on_ground and reference is None:
         reference = _windows(layout, str(map))
-    if reference is not None and place_map is not None and layout.has_north:
+    if reference is not None and place_map is not None and layout.on_ground:
         own = reference.layout.same(layout)
         expect(own, "that of the map, or no reference", f"{reference.name} is not the area of {map}")
     layout = layout if reference is None else reference.layout

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from dejavu_torch.places.layout import Layout, Run
+from dejavu_torch.places.layout import Layout
 from dejavu_torch.places.positions import (
     borders,
     count_places,
@@ -17,6 +17,7 @@ from dejavu_torch.places.positions import (
     positions_behind,
     shown_frames,
 )
+from dejavu_torch.places.rectangles import Run
 from dejavu_torch.text import InputError
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from functools import lru_cache
 from itertools import accumulate, groupby, islice, pairwise
 from typing import Any, NamedTuple
 
@@ -13,85 +12,25 @@ import torch.nn.functional as F
 from torch import Tensor
 from typing_extensions import Self
 
+from dejavu_torch.places.rectangles import (
+    GAP,
+    Cell,
+    Point,
+    Rectangle,
+    Run,
+    borders_of,
+    boxes,
+    cells_of,
+    orders_of,
+    tables_of,
+    triangles,
+)
 from dejavu_torch.places.states import Link, States
 from dejavu_torch.text import expect
 
-SIDE = 128  # windows of a tile to a side
-GAP = 16  # windows between lattices in one plane: more than a camera moves from image to image
 FAR = 2**31  # places that are never near
 SPARSE = 4  # a lattice may span so many times as many rows x columns as it has windows
 NORTH, STRIDE = 1.0, 1e-3  # degrees that windows of one map may differ by, and share of a step
-
-Cell = tuple[int, int]  # row and column
-Point = tuple[float, float]  # x and y
-
-
-def _sum(one: Cell, other: Cell) -> Cell:
-    return one[0] + other[0], one[1] + other[1]
-
-
-class Tables(NamedTuple):
-    """The first cell of each tile (T,2), its rows and columns (T,2), and its first place (T,)."""
-
-    corner: Tensor
-    size: Tensor
-    start: Tensor
-
-
-class Ground(NamedTuple):
-    """Where the pixels of a picture lie.
-
-    Args:
-        first: (x, y) of its upper left corner. right, down: (x, y) from a pixel to the next of its row, and
-            of its column. unit: of these, "px" or "m". frame: of the coordinates, see `Coordinates`.
-    """
-
-    first: Point = (0.0, 0.0)
-    right: Point = (1.0, 0.0)
-    down: Point = (0.0, 1.0)
-    unit: str = "px"
-    frame: str = "pixels"
-
-    def scaled(self, across: float, down: float) -> Ground:
-        """That of pixels so many times as large."""
-        (a, b), (c, d) = self.right, self.down
-        return self._replace(right=(a * across, b * across), down=(c * down, d * down))
-
-    def at(self, pixels: Tensor) -> Tensor:
-        """(x, y) of points (column, row) in pixels from the corner, (...,2) float64."""
-        return pixels @ pixels.new_tensor([self.right, self.down]) + pixels.new_tensor(self.first)
-
-
-class Rectangle(NamedTuple):
-    """Places in rows and columns, whose numbers follow each other.
-
-    Args:
-        rows, columns: of places. first: (x, y) of the middle of the first window. right, down: (x, y) from a
-            window to the next of its row, and of its column. corner: row and column of the first in the
-            lattice of its route. route: its number. frames: of the reference; None is one for each place.
-    """
-
-    rows: int
-    columns: int = 1
-    first: Point = (0.0, 0.0)
-    right: Point = (1.0, 0.0)
-    down: Point = (0.0, 1.0)
-    corner: Cell = (0, 0)
-    route: int = 0
-    frames: int | None = None
-
-    @property
-    def places(self) -> int:
-        """The number of windows."""
-        return self.rows * self.columns
-
-
-class Run(NamedTuple):
-    """Places of one route whose numbers follow each other: the route, and how many places and frames."""
-
-    route: int
-    places: int
-    frames: int
 
 
 class Reach(NamedTuple):
@@ -119,7 +58,8 @@ class Layout:
     Attributes:
         rectangles: in the order of the places. routes: the names of several routes; () of a single one.
         dimensions: 1 along routes, 2 over areas; what is tuned for each is a table by it, beside its user.
-        places, count: N, and the number of routes. rows, columns: of a plane in which all lie, lattices apart
+        places, count: N, and the number of routes. runs: those of consecutive places of one route. rows,
+            columns: of a plane in which all lie, lattices apart
             from each other; not all rows and columns are places.
 
     Convention: places are numbered tile by tile and in a tile row by row, so that a tile is a run of places.
@@ -167,6 +107,10 @@ class Layout:
         self.count = 1 + max(one.route for one in rectangles)
         self._corners, (self.rows, self.columns) = self._in_a_plane()
         self._plain = self.dimensions == len(rectangles) == 1  # along which places are numbered
+        self.runs = tuple(
+            Run(route, *map(sum, zip(*((one.places, one.shown) for one in parts), strict=True)))
+            for route, parts in groupby(self.rectangles, lambda one: one.route)
+        )
 
     @classmethod
     def of(
@@ -213,16 +157,6 @@ class Layout:
         """Itself, if it is that of an area; None along routes."""
         return self if self.dimensions == 2 else None
 
-    @property
-    def runs(self) -> tuple[Run, ...]:
-        """The runs of places of one route each, in the order of their numbers."""
-        found = []
-        for route, group in groupby(self.rectangles, lambda one: one.route):
-            parts = [*group]
-            frames = sum(one.places if one.frames is None else one.frames for one in parts)
-            found.append(Run(route, sum(one.places for one in parts), frames))
-        return (*found,)
-
     def names(self, own: str) -> tuple[str, ...]:
         """Of the routes; `own` of a single one without a name."""
         return self.routes or (own,)
@@ -268,18 +202,18 @@ class Layout:
     @property
     def tiles(self) -> list[Cell]:
         """Rows and columns of each tile."""
-        return [(rows, columns) for rows, columns in _tables(self).size.tolist()]
+        return [(rows, columns) for rows, columns in tables_of(self.rectangles, self._corners).size.tolist()]
 
     @property
     def corners(self) -> list[Cell]:
         """Row and column of the first window of each tile."""
-        return [(row, column) for row, column in _tables(self).corner.tolist()]
+        return [(row, column) for row, column in tables_of(self.rectangles, self._corners).corner.tolist()]
 
     def columns_from(self, place: int) -> int:
         """The columns of the chunk that begins at a place."""
         if self.dimensions == 1:
             return 1
-        tables = _tables(self)
+        tables = tables_of(self.rectangles, self._corners)
         return int(tables.size[int((tables.start == place).nonzero()[0]), 1])
 
     # ------------------------------------------------------------------ in rows and columns
@@ -297,8 +231,11 @@ class Layout:
             for rows, columns in extents:
                 starts.append((top, left))
                 top, left = top + down * (rows + GAP), left + across * (columns + GAP)
-            corners = (*(_sum(one.corner, starts[one.route]) for one in self.rectangles),)
-            ends = [_sum(start, size) for start, size in zip(starts, extents, strict=True)]
+            corners = tuple(
+                (one.corner[0] + starts[one.route][0], one.corner[1] + starts[one.route][1])
+                for one in self.rectangles
+            )
+            ends = [(at[0] + size[0], at[1] + size[1]) for at, size in zip(starts, extents, strict=True)]
             return corners, (max(row for row, _ in ends), max(column for _, column in ends))
 
         ways = [along(1, 0), along(0, 1)][: self.dimensions]  # routes of one column follow each other
@@ -356,17 +293,12 @@ class Layout:
         return (self._orders()[0] < self.places).float().view(self.rows, self.columns)
 
     def _orders(self) -> tuple[Tensor, Tensor]:
-        """The places row by row, (R C,), N where there is none, and the number of each place row by row,
-        (N,), int64."""
-        with torch.inference_mode(False):  # cached tensors are also used with gradients
-            return _cached_orders(self, SIDE)
+        """See `orders_of`."""
+        return orders_of(self.rectangles, self._corners, (self.rows, self.columns))
 
     def cells(self, places: Tensor) -> Tensor:
         """Row and column of places, int64 of any shape -> (..., 2)."""
-        corner, size, start = (table.to(places.device) for table in _tables(self))
-        tile = torch.bucketize(places.contiguous(), start, right=True) - 1
-        inside, width = places - start[tile], size[tile, 1]
-        return corner[tile] + torch.stack([inside // width, inside % width], -1)
+        return cells_of(places, tables_of(self.rectangles, self._corners))
 
     def place_at(self, cells: Tensor) -> Tensor:
         """The places of rows and columns, (..., 2) -> (...); -1 where none is."""
@@ -379,7 +311,7 @@ class Layout:
         if len(self.rectangles) > 1:
             found = self._orders()[0].to(row.device)[row * self.columns + column]
             return found.masked_fill(found == self.places, -1)
-        down, across = (edges.to(row.device) for edges in _borders(self.rows, self.columns))
+        down, across = (edges.to(row.device) for edges in borders_of(self.rows, self.columns))
         at, beside = (
             torch.bucketize(cells.contiguous(), edges[1:-1], right=True)
             for cells, edges in ((row, down), (column, across))
@@ -502,6 +434,8 @@ class Layout:
     @property
     def joins(self) -> tuple[Link, ...]:
         """The steps from one rectangle of a route to the next."""
+        if self._plain:
+            return ()
         parts = sorted(
             (one.route, one.corner[0], start, start + one.places - 1)
             for one, start in zip(self.rectangles, self._firsts, strict=True)
@@ -577,7 +511,7 @@ class Layout:
         return math.hypot(*self.right)
 
     @property
-    def has_north(self) -> bool:
+    def on_ground(self) -> bool:
         """Whether its windows look in a known direction, as those over the ground do."""
         return self.dimensions == 2
 
@@ -668,7 +602,7 @@ class Layout:
             return True
         known = bool(self.frame and other.frame)
         mine, yours = (
-            [(one.corner, one.rows, one.columns, known and one[2:5]) for one in layout.rectangles]
+            [(one.route, one.corner, one[:2], known and one[2:5]) for one in layout.rectangles]
             for layout in (self, other)
         )
         return mine == yours and (not known or self.system == other.system)
@@ -751,7 +685,7 @@ class Layout:
         if self.dimensions == 2:
             added = self._beside(own, other, name)._replace(route=route)
         elif last.route == route:  # its chunks follow
-            rows, shown = last.rows + other.places, (last.frames or last.rows) + (frames or other.places)
+            rows, shown = last.rows + other.places, last.shown + (frames or other.places)
             longer = last._replace(rows=rows, frames=None if shown == rows else shown)
             return type(self).of([*self.rectangles[:-1], longer], self.unit, self.frame, self.routes)
         else:
@@ -833,78 +767,6 @@ def agree(one: str, other: str) -> bool:
     return "" in (one, other) or one == other
 
 
-def boxes(mass: Tensor, radius: int) -> Tensor:
-    """Sums over squares of 2 radius + 1 windows to a side, (T,R,C) -> (T,R,C)."""
-    side = 2 * radius + 1
-    sums: Tensor = F.avg_pool2d(mass[:, None], side, 1, radius, divisor_override=1)[:, 0]
-    return sums
-
-
-def triangles(mass: Tensor, radius: int) -> Tensor:
-    """Sums with weights of a triangle that ends at a radius, (Q,N) -> (Q,N): two box filters."""
-    radius = min(radius, mass.shape[1])
-    return window_sums(window_sums(F.pad(mass, (radius, radius)), radius + 1), radius + 1) / (radius + 1)
-
-
-def window_sums(values: Tensor, width: int) -> Tensor:
-    """Sums of `width` neighbours, (..., N + width - 1) -> (..., N).
-
-    Example:
-        >>> window_sums(torch.tensor([1.0, 2, 3, 4]), 3)
-        tensor([6., 9.])
-    """
-    count, size, at, total = values.shape[-1] - width + 1, 1, 0, torch.zeros(())
-    while True:  # sums of 1, 2, 4, .. neighbours, which is several times as fast as pooling
-        if width & size:
-            total, at = total + values.narrow(-1, at, count), at + size
-        if (size := 2 * size) > width:
-            return total
-        values = values[..., : -(size // 2)] + values[..., size // 2 :]
-
-
 def _pair(values: Sequence[float]) -> Point:
     x, y = values
     return x, y
-
-
-def _tables(layout: Layout) -> Tables:
-    with torch.inference_mode(False):  # cached tensors are also used with gradients
-        return _cached_tables(layout, SIDE)
-
-
-@lru_cache(16)
-def _cached_tables(layout: Layout, side: int) -> Tables:
-    corners, sizes = list[Tensor](), list[Tensor]()
-    for part, corner in zip(layout.rectangles, layout._corners, strict=True):
-        down, across = _borders(part.rows, part.columns)
-        corners.append(torch.cartesian_prod(down[:-1], across[:-1]).view(-1, 2) + torch.tensor(corner))
-        sizes.append(torch.cartesian_prod(down.diff(), across.diff()).view(-1, 2))
-    size = torch.cat(sizes)
-    return Tables(torch.cat(corners), size, torch.cat([size.new_zeros(1), size.prod(1).cumsum(0)[:-1]]))
-
-
-def _borders(rows: int, columns: int) -> tuple[Tensor, Tensor]:
-    """The borders of tiles, rows and columns."""
-    with torch.inference_mode(False):
-        return _cached_borders(rows, columns, SIDE)
-
-
-@lru_cache(64)
-def _cached_borders(rows: int, columns: int, side: int) -> tuple[Tensor, Tensor]:
-    down = _edges(rows, max(side, side * side // columns))
-    return down, _edges(columns, max(1, side * side // max(1, int(down.diff().max()))))
-
-
-@lru_cache(2)  # of 16 bytes a window
-def _cached_orders(layout: Layout, side: int) -> tuple[Tensor, Tensor]:
-    cells = layout.cells(torch.arange(layout.places))
-    rank = cells[:, 0] * layout.columns + cells[:, 1]
-    order = torch.full((layout.rows * layout.columns,), layout.places)
-    order[rank] = torch.arange(layout.places)
-    return order, rank
-
-
-def _edges(count: int, most: int) -> Tensor:
-    """Borders of equal parts of about so many."""
-    parts = max(1, round(count / most))
-    return torch.arange(parts + 1) * count // parts

@@ -13,7 +13,8 @@ import torch
 from torch import Tensor
 
 from dejavu_torch.memory import check_room
-from dejavu_torch.places.layout import Layout, boxes
+from dejavu_torch.places.layout import Layout
+from dejavu_torch.places.rectangles import boxes
 from dejavu_torch.recognition.evidence import RankTable, Spacing, Standardised, place_means, standardised
 from dejavu_torch.recognition.motion import MIN_PROBABILITY, logits
 from dejavu_torch.recognition.plane import Steps, inside_of, rings

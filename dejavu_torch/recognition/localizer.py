@@ -146,7 +146,7 @@ class Localizer:
         if not len(descriptors):
             return self.match(descriptors.new_zeros(0, places))
         wanted = [(matching.k or 1, matching.radius), (min(2, places), TOLERANCE)]
-        n = num_needed(wanted, place_map.layout)
+        n = num_needed(wanted, self.layout)
         few = n <= max(1, MAX_SHARE * min(places, place_map.block_places)) or places > SCORES_AT_ONCE
         searches = not self.models and matching.callback is None and matching.apart is None
         searches = searches and (type(self.searcher) is not Scan or (few and places > SHORT))

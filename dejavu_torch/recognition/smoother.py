@@ -11,7 +11,8 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 from typing_extensions import Self
 
-from dejavu_torch.places.layout import ROUTE, window_sums
+from dejavu_torch.places.layout import ROUTE
+from dejavu_torch.places.rectangles import window_sums
 from dejavu_torch.places.states import Link, States
 from dejavu_torch.recognition.evidence import (
     RankTable,

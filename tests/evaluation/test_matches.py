@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 
 from dejavu_torch.evaluation.matches import ELSEWHERE, read_matches, write_matches
 from dejavu_torch.places.frame_table import FrameTable
-from dejavu_torch.places.layout import Layout, Rectangle
+from dejavu_torch.places.layout import Layout
+from dejavu_torch.places.rectangles import Rectangle
 from dejavu_torch.types import InputError, Match
 
 INF = float("inf")

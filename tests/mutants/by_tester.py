@@ -201,7 +201,7 @@ MUTANTS = [
     ),
     Mutant(
         "A filter's score of a place counts its neighbours up to `within` places away.",
-        "dejavu_torch/places/layout.py",
+        "dejavu_torch/places/rectangles.py",
         "radius = min(radius, mass.shape[1])",
         "radius = min(radius, mass.shape[1]) // 2 * 2",
         ("tests/test_behaviour.py::test_a_filter_counts_neighbours_up_to_within",),

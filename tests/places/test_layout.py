@@ -10,8 +10,9 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dejavu_torch.places import layout as layouts
-from dejavu_torch.places.layout import Layout, Rectangle
+from dejavu_torch.places import rectangles
+from dejavu_torch.places.layout import FAR, Layout
+from dejavu_torch.places.rectangles import Rectangle
 
 sides = st.integers(1, 12)
 
@@ -19,7 +20,7 @@ sides = st.integers(1, 12)
 @pytest.fixture(autouse=True, scope="module")
 def small_tiles():
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(layouts, "SIDE", 4)
+        patch.setattr(rectangles, "SIDE", 4)
         yield
 
 
@@ -84,7 +85,7 @@ def test_places_of_one_route_are_near_by_rows_and_columns_and_no_others(layout, 
     every = torch.arange(layout.places)
     route, far = layout.route_of(every), layout.distance(every[:, None], every)
     alike = route[:, None] == route
-    assert bool((far[~alike] >= layouts.FAR).all())
+    assert bool((far[~alike] >= FAR).all())
     cells = layout.cells(every)
     assert torch.equal(far[alike], (cells[:, None] - cells).abs().amax(2)[alike])
     assert torch.equal(layout.place_at(cells), every)
@@ -153,7 +154,7 @@ def test_places_that_are_not_of_one_ground_are_never_near(sizes):
     for one in each:
         own = torch.arange(start, start + one.places)
         others = torch.cat([torch.arange(start), torch.arange(start + one.places, joined.places)])
-        assert int(joined.distance(own[:, None], others).min()) >= layouts.FAR
+        assert int(joined.distance(own[:, None], others).min()) >= FAR
         assert torch.equal(
             joined.distance(own[:, None], own), one.distance(own[:, None] - start, own - start)
         )

@@ -32,7 +32,7 @@ from dejavu_torch.data.simulate.aerial import (
 )
 from dejavu_torch.data.simulate.route import Random, rgb
 from dejavu_torch.memory import check_room, in_float32, in_one_thread
-from dejavu_torch.places.layout import Ground
+from dejavu_torch.places.rectangles import Ground
 from dejavu_torch.types import expect
 
 PIXELS = 4  # per metre
