@@ -214,14 +214,14 @@ def _calibration(
     place_map: PlaceMap, queries: Tensor, places: Tensor, scores: Iterator[Tensor]
 ) -> Calibration:
     """The calibration by the scores of all queries of a drive, which the smoother has centred."""
-    smoother, starts = PlaceSmoother(), place_map.route_starts
+    smoother, layout = PlaceSmoother(), place_map.layout
     smoother.map_links = place_map.connections
 
     def rows(numbers: Tensor) -> Tensor:
         return place_map.scores(queries[numbers])
 
-    smoother.fit(rows, queries, starts)
-    return calibrated_by_drive(scores, places, smoother, smoother.drive(rows, queries), starts)
+    smoother.fit(rows, queries, layout.starts)
+    return calibrated_by_drive(scores, places, smoother, smoother.drive(rows, queries), layout)
 
 
 def _at_once(place_map: PlaceMap) -> int:

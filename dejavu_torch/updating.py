@@ -159,7 +159,7 @@ def _recognised(place_map: SpectralMap, queries: Tensor, match: Match) -> bool:
     assert match.probability is not None
     sure = (match.probability[:, 0] >= SURE).nonzero()[:, 0]
     best = [place_map.scores(part).argmin(1) for part in queries[sure.to(queries.device)].split(BATCH)]
-    near = (torch.cat(best).cpu() - match.index[sure, 0]).abs() <= TOLERANCE
+    near = place_map.layout.distance(torch.cat(best).cpu(), match.index[sure, 0]) <= TOLERANCE
     return float(near.double().mean()) >= RECOGNISED
 
 

@@ -28,7 +28,7 @@ from dejavu_torch.data.flight import Flight
 from dejavu_torch.data.geotiff import from_degrees
 from dejavu_torch.data.grid import Grid
 from dejavu_torch.data.ground_truth import find_ground_truth
-from dejavu_torch.data.picture import Picture, read_picture
+from dejavu_torch.data.picture import PictureFile, read_picture
 from dejavu_torch.data.source import check_not_read
 from dejavu_torch.places.rectangles import Ground
 from dejavu_torch.resize import resize_frames
@@ -69,7 +69,7 @@ def geotiff(tmp_path):
 @given(scale=st.sampled_from([1.0, 0.7, 0.5, 0.23]), seed=st.integers(0, 99), data=st.data())
 def test_a_part_is_that_of_the_whole_picture(scale, seed, data):
     pixels = ground(300, 410, seed=seed)
-    picture = Picture((3, 300, 410), lambda a, b, c, d: pixels[:, a:b, c:d], scale)
+    picture = PictureFile((3, 300, 410), lambda a, b, c, d: pixels[:, a:b, c:d], scale)
     small = resize_frames(pixels[None].float(), tuple(picture.full))[0].round().clamp(0, 255)
     height, width = picture.full
     whole = picture[:, 0:height, 0:width]
@@ -78,7 +78,7 @@ def test_a_part_is_that_of_the_whole_picture(scale, seed, data):
     assert float((whole != small).float().mean()) < 0.03  # halves are rounded to either side
     top, left = data.draw(st.integers(0, height - 1)), data.draw(st.integers(0, width - 1))
     bottom, right = data.draw(st.integers(top + 1, height)), data.draw(st.integers(left + 1, width))
-    fresh = Picture((3, 300, 410), lambda a, b, c, d: pixels[:, a:b, c:d], scale).part(
+    fresh = PictureFile((3, 300, 410), lambda a, b, c, d: pixels[:, a:b, c:d], scale).part(
         top, bottom, left, right
     )
     assert torch.equal(fresh[:, 0 : bottom - top, 0 : right - left], whole[:, top:bottom, left:right])
@@ -90,7 +90,7 @@ def test_a_tiff_is_read_in_parts(geotiff, monkeypatch):
     pixels = ground(200, 260)
     path = geotiff(pixels)
     grid = open_source(f"grid:{path}?window=48&stride=12&scale=.5&rows=10:90&columns=6:130")
-    assert isinstance(grid.picture, Picture)
+    assert isinstance(grid.picture, PictureFile)
     Image.fromarray(pixels.permute(1, 2, 0).numpy()).save(path.with_suffix(".png"))
     whole = open_source(
         f"grid:{path.with_suffix('.png')}?window=48&stride=12&scale=.5&rows=10:90&columns=6:130"
@@ -241,7 +241,7 @@ def test_blocks_at_a_border_count_as_whole_ones(monkeypatch):
     monkeypatch.setattr(pictures, "SIDE_READ", 64)
     monkeypatch.setattr(pictures, "HELD", 3 * 64 * 64 * 4)
     pixels = ground(65, 640)
-    picture = Picture((3, 65, 640), lambda a, b, c, d: pixels[:, a:b, c:d])
+    picture = PictureFile((3, 65, 640), lambda a, b, c, d: pixels[:, a:b, c:d])
     assert torch.equal(picture[:, 0:65, 0:640], pixels)
     assert len(picture._blocks) <= 4 + 1
 

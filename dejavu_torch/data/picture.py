@@ -34,7 +34,7 @@ TIFF, ORIENTATION, GEOREFERENCED = {".tif", ".tiff"}, 274, {33550, 34264}  # tag
 Read: TypeAlias = Callable[[int, int, int, int], Tensor]
 
 
-class Picture:
+class PictureFile:
     """A picture that is read where it is indexed, `picture[:, 10:74, 20:84]`, as a tensor (C,H,W) uint8 is.
 
     Args:
@@ -58,7 +58,7 @@ class Picture:
     def __getstate__(self) -> Facts:
         return self.__dict__ | {"_blocks": {}}
 
-    def part(self, top: int, bottom: int, left: int, right: int) -> Picture:
+    def part(self, top: int, bottom: int, left: int, right: int) -> PictureFile:
         """The pixels of some rows and columns."""
         other = copy.copy(self)
         other.corner = self.corner[0] + top, self.corner[1] + left
@@ -108,7 +108,7 @@ def _reduced(down: Tensor, pixels: Tensor, across: Tensor) -> Tensor:
     return (down @ pixels.float() @ across.T).round().byte()
 
 
-Pixels: TypeAlias = Tensor | Picture  # (C,H,W) uint8
+Pixels: TypeAlias = Tensor | PictureFile  # (C,H,W) uint8
 
 
 def read_picture(
@@ -132,7 +132,7 @@ def read_picture(
     orientation = _orientation(path) if path.suffix.lower() in TIFF and has_rasterio() else 0
     tiff = GeoTiff(path) if orientation else None
     in_parts = tiff if tiff and tiff.plain and (tiff.ground or orientation == 1) else None
-    picture = Picture(in_parts.shape, in_parts, scale) if in_parts else _decoded(path, scale, tiff)
+    picture = PictureFile(in_parts.shape, in_parts, scale) if in_parts else _decoded(path, scale, tiff)
     ground = tiff.ground.scaled(*picture.factor[::-1]) if tiff and tiff.ground else Ground()
     (x, y), (a, b), (c, d), unit, _ = ground
     if unit == "m" and a * d > b * c:  # its first row is below
@@ -159,7 +159,7 @@ def _orientation(path: Path) -> int:
     return 1  # rasterio reads what Pillow does not
 
 
-def _decoded(path: Path, scale: float, tiff: GeoTiff | None) -> Picture:
+def _decoded(path: Path, scale: float, tiff: GeoTiff | None) -> PictureFile:
     """An image file that Pillow decodes whole."""
     with _opened(path) as image:
         width, height = image.size
@@ -179,7 +179,7 @@ def _decoded(path: Path, scale: float, tiff: GeoTiff | None) -> Picture:
             pixels = pixels * (np.asarray(part.convert("RGBA"))[..., 3:] > 0)
         return as_bytes(path, pixels.transpose(2, 0, 1))
 
-    return Picture((3 if plain == "RGB" else 1, image.height, image.width), read, scale)
+    return PictureFile((3 if plain == "RGB" else 1, image.height, image.width), read, scale)
 
 
 @contextmanager

@@ -493,7 +493,8 @@ def check_places(model: DejaVu, places: int, name: str) -> None:
 def _check_given_map(model: DejaVu, places: Tensor, name: str, tolerance: int) -> None:
     """Warn if the map finds few of the descriptors (N,K) that it was made of."""
     sample = torch.arange(0, len(places), max(1, len(places) // SAMPLED))
-    distance = (model.localize_descriptors(places[sample]).index - sample).abs()
+    found = model.localize_descriptors(places[sample]).index.clamp(min=0)
+    distance = model.map.layout.distance(found, sample)
     near = int((distance <= max(tolerance, NEAR)).sum())
     if near < 0.5 * len(sample) and model.map.summary().covered:
         expected = "expected the reference that the map was made of"

@@ -259,7 +259,7 @@ def calibrated_by_drive(
     places: Tensor,
     smoother: PlaceSmoother,
     drive: Drive,
-    route_starts: Sequence[int] = (0,),
+    layout: Layout,
 ) -> Calibration:
     """Fit on all queries of a drive whose places nobody told: each counts as right with the probability that
     the others of the drive give its answer.
@@ -267,21 +267,22 @@ def calibrated_by_drive(
     Args:
         blocks: the scores of consecutive queries, (B,N) each. places: (Q,), where a smoother is sure, else
             -1: without the scores near these, queries stand for some off the map.
-        smoother, drive: fitted to all queries.
+        smoother, drive: fitted to all queries. layout: of the places.
     """
     single: tuple[list[Tensor], ...] = [], [], []  # answers, confidences, and those off the map
     filtered: tuple[list[Tensor], ...] = [], [], []
-    tracks, filters, first = (Track(), Track()), (PlaceFilter(), PlaceFilter()), 0
+    tracks, first = (Track(layout), Track(layout)), 0
+    filters = [PlaceFilter().over(layout) for _ in tracks]
     states: list[Tensor] = []
     for scores in blocks:
         place = places[first : first + len(scores)].to(scores.device)
         first, known = first + len(scores), place >= 0
         states = states or [filter.start(scores.shape[1]).to(scores) for filter in filters]
-        near = scores.scatter(1, _window(place, 2 * TOLERANCE, scores), math.inf)
+        near = scores.scatter(1, layout.around(place.clamp(min=0), 2 * TOLERANCE), math.inf)
         for i, rows in enumerate((scores, torch.where(known[:, None], near, scores))):
-            belief, states[i] = filters[i].step(rows, states[i], route_starts)
+            belief, states[i] = filters[i].step(rows, states[i], layout.starts)
             track = tracks[i](belief, rows)
-            pairs = (single, rows, confidence_of(rows).cpu()), (filtered, belief, track)
+            pairs = (single, rows, confidence_of(rows, layout).cpu()), (filtered, belief, track)
             for found, scored, confidences in pairs:
                 if i:
                     found[2].append(confidences[known.cpu()])
@@ -290,13 +291,13 @@ def calibrated_by_drive(
                     found[1].append(confidences)
     answers = [torch.cat(found[0]) for found in (single, filtered)]
     right: tuple[list[Tensor], list[Tensor]] = [], []
-    for block in smoother.blocks(drive, route_starts):
+    for block in smoother.blocks(drive, layout.starts):
         others = smoother.folded(block.before * block.after).cpu().double()
         others = (others / others.sum(1, keepdim=True))[:, :-1]
         own = slice(block.first, block.first + len(others))
         for masses, index in zip(right, answers, strict=True):
-            near = torch.zeros_like(others).scatter(1, _window(index[own], TOLERANCE, others), 1.0)
-            masses.append(torch.where(index[own] >= 0, (near * others).sum(1), 0.0))
+            near = layout.mass_near(others, index[own].clamp(min=0), TOLERANCE)
+            masses.append(torch.where(index[own] >= 0, near, 0.0))
     platts = []
     for (_, sure, off), masses in zip((single, filtered), right, strict=True):
         known, p = torch.cat(sure).double(), torch.cat(masses[::-1]).clamp(0, 1)
