@@ -63,7 +63,7 @@ class Subject(NamedTuple):
     """What is learned: its sources, further words, and commands that make the map from it.
 
     second, drive, more: other visits, and new ground. truth: of the visits. asked: words of all commands
-    that ask. then: commands after learning.
+    that ask. then: commands after learning. longer: words of an --append.
     """
 
     sources: tuple[str, ...]
@@ -75,6 +75,7 @@ class Subject(NamedTuple):
     truth: str = "0"
     asked: tuple[str, ...] = ()
     then: tuple[tuple[str, ...], ...] = ()
+    longer: tuple[str, ...] = ()
 
 
 def seen(route: int, visit: int, cut: str = "") -> str:
@@ -100,7 +101,8 @@ SUBJECTS = {
             ("learn", seen(2, 0), "--map", "{out}/other.safetensors", *FEW[:2], "--whitening", "{map}"),
             ("merge", "{out}/other.safetensors", "{map}", "--map", "{out}/both.safetensors"),
             ("mv", "{out}/both.safetensors", "{map}"),
-        )
+        ),
+        longer=("--route", "map"),
     ),
     "grown": ROUTE._replace(
         sources=(seen(1, 0, "?stop=90"),),
@@ -279,7 +281,7 @@ class Table:
             marks["map"].write_bytes(self.learned[name])
         for action in done:
             if action.edit:
-                call(words(action.edit))
+                call(words((*action.edit, *subject.longer * ("--append" in action.edit))))
         query = subject.query
         for action in done:
             if action.query is not None:
