@@ -30,6 +30,7 @@ from dejavu_torch import (
 from dejavu_torch.data.grid import Grid
 from dejavu_torch.evaluation.baselines import stored_frames
 from dejavu_torch.features.views import Sample
+from dejavu_torch.learning import Checkpoint
 from dejavu_torch.maps.spectral_map import SpectralMap
 from dejavu_torch.maps.spectrum import by_frequency, frequencies, from_lines, lines_of
 from dejavu_torch.places.layout import Layout
@@ -536,7 +537,7 @@ def test_narrow_areas_have_long_tiles():
     assert len(Layout(10_000, 3).tiles) == len(Layout(3, 10_000).tiles) == 2
 
 
-def test_a_large_area_is_learned_tile_by_tile(pictures, small_tiles, monkeypatch):
+def test_a_large_area_is_learned_tile_by_tile(pictures, small_tiles, monkeypatch, tmp_path):
     source, few = f"grid:{pictures}/one.png?window=48&stride=8", Whitening(views=2)
     whole = DejaVu(whitening=few, mapper=SpectralMapper(8.0)).learn(source)
     long_from(monkeypatch, 200)
@@ -546,6 +547,17 @@ def test_a_large_area_is_learned_tile_by_tile(pictures, small_tiles, monkeypatch
     assert parts.map.columns.tolist() == [columns for _, columns in parts.map.area.tiles]  # type: ignore[union-attr]
     found = parts.localize(source)
     assert float((found.index == torch.arange(parts.map.places)).double().mean()) > 0.9
+
+    def stopped(encode, tasks):
+        yield from map(encode, tasks[:3])
+        raise KeyboardInterrupt
+
+    again = DejaVu(whitening=Whitening(views=2), mapper=SpectralMapper(8.0))
+    with pytest.raises(KeyboardInterrupt):
+        again.learn(source, checkpoint=Checkpoint(tmp_path / "m"), map_tasks=stopped)
+    again.learn(source, checkpoint=Checkpoint(tmp_path / "m"))
+    assert all(map(torch.equal, again.map.packed().values(), parts.map.packed().values()))
+    assert again.map.layout == parts.map.layout
 
 
 def test_what_a_map_of_an_area_does_not_do_is_refused(pictures, small_tiles):

@@ -323,25 +323,30 @@ def test_descriptors_of_a_long_route_in_one_chunk_lie_in_a_file(monkeypatch):
     assert found_share(DejaVu(whitening=Whitening(numbers=32)).learn(values), values) > 0.95
 
 
-def test_places_appended_to_a_map_are_kept_as_well(tmp_path, made):
+@pytest.mark.parametrize("name", [None, "first"])
+def test_places_appended_to_a_map_are_kept_as_well(tmp_path, made, name):
     first, rest = route()[:500], route()[500:]
     visits = LabelledFrames(ArrayTraverse(rest + 0.1), torch.arange(len(rest)))
+    model = learned(first)
+    if name:
+        model = growth.merge([model, model], [name, "second"])
+    model.save(tmp_path / "before")
 
     def grown(**work):
-        model = learned(first)
+        model = DejaVu.load(tmp_path / "before")
         made.clear()
-        return growth.append(model, rest, visits=visits, **work)  # type: ignore[arg-type]
+        return growth.append(model, rest, visits=visits, route=name, **work)  # type: ignore[arg-type]
 
     whole = grown()
     assert made == [CHUNK] * 10 + [30]
-    assert whole.map.visits.tolist() == [[500, 1], [PLACES - 500, 2]]
+    assert whole.map.visits.tolist() == [[1000 if name else 500, 1], [PLACES - 500, 2]]
     with pytest.raises(KeyboardInterrupt):
         grown(checkpoint=Checkpoint(tmp_path / "m"), map_tasks=stopped(4))
     again = grown(checkpoint=Checkpoint(tmp_path / "m"))
     assert sum(made) == PLACES - 500 - 4 * CHUNK
     assert file_of(again, tmp_path) == file_of(whole, tmp_path)
     with refused("m.part", "map"):  # it has more places by now
-        growth.append(again, rest, visits=visits, checkpoint=Checkpoint(tmp_path / "m"))
+        growth.append(again, rest, visits=visits, route=name, checkpoint=Checkpoint(tmp_path / "m"))
 
 
 def visits_of(places):

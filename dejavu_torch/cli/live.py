@@ -34,8 +34,7 @@ log = logging.getLogger("dejavu_torch")
 def _pictures_of(model: DejaVu, reference: str) -> ReferencePictures:
     """The pictures of the map's reference, or an InputError."""
     layout = model.map.layout
-    seen = f"--reference {reference}: the map has {layout.count} routes"
-    layout.expect_one("the map of one route, or no --reference", seen)
+    layout.expect_one("the map of one route, or no --reference", f"--reference {reference}: the map")
     traverse = open_source(reference)
     same = layout.same(traverse.layout)
     expect(same, "the area of the map", f"--reference {reference} is another one")

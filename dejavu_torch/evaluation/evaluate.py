@@ -177,8 +177,10 @@ def _map_of(map: Path, route: str | None) -> PlaceMap:
     """The map of a file, or that of one of its routes."""
     place_map = read_place_map(map)
     if route is None:
-        place_map.layout.expect_one("--route with the one of the truth", f"{map} has the routes {{}}")
-    return place_map.part(str(route)) if isinstance(place_map, SpectralMap) and route else place_map
+        place_map.layout.expect_one("--route with the one of the truth", str(map))
+    if place_map.layout.count == 1 or not isinstance(place_map, SpectralMap):
+        return place_map
+    return place_map.part(str(route))
 
 
 def _windows(layout: Layout, name: str) -> Traverse:

@@ -355,7 +355,7 @@ class SpectralMap(PlaceMap):
         `growth.merge` checks the maps."""
         place_map = parts[0]._without_places(torch.cat([part.means for part in parts]))
         place_map.layout = Layout.merged([part.table.counted for part in parts], names)
-        known = [part.turned for part in parts if len(part.turned)]
+        known = [one for part in parts if len(part.turned) for one in [part.turned] * part.layout.count]
         if known:
             place_map.turned = torch.stack(known).float().mean(0).round().to(torch.int8)
         place_map.extend(chunk for part in parts for chunk in part.coded())
@@ -575,7 +575,9 @@ class SpectralMap(PlaceMap):
         fits = given in (0, len(lengths)) and all(map(_divides, widths, lengths))
         require(fits, f"tiles of {widths!s:.100} columns; expected divisors of {lengths!s:.100}")
         tiles = [(places // width, width) for places, width in zip(lengths, widths, strict=True)]
-        self.layout.expect_tiles(tiles)
+        layout, seen = self.layout, f"{self.layout.places} places of a layout"
+        require(layout.places >= self.places, f"{seen}; expected {self.places}")
+        layout.expect_tiles(tiles)
         require(bool(self.stage_scale.isfinite().all()), "a stage that is not finite")
         turned, square = tuple(self.turned.shape), 2 * (self.dimension,)
         require(turned in ((0, 0), square), f"turned images {turned}; expected {square}")

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
+from bisect import bisect_right
 from collections.abc import Mapping, Sequence
-from itertools import accumulate, groupby, islice, pairwise
+from itertools import accumulate, groupby, pairwise
 from typing import Any, NamedTuple
 
 import torch
@@ -28,6 +29,7 @@ from dejavu_torch.places.rectangles import (
 from dejavu_torch.places.states import Link, States
 from dejavu_torch.text import expect
 
+LARGEST = 2**31 - 1  # places of a map
 FAR = 2**31  # places that are never near
 SPARSE = 4  # a lattice may span so many times as many rows x columns as it has windows
 NORTH, STRIDE = 1.0, 1e-3  # degrees that windows of one map may differ by, and share of a step
@@ -58,7 +60,8 @@ class Layout:
     Attributes:
         rectangles: in the order of the places. routes: the names of several routes; () of a single one.
         dimensions: 1 along routes, 2 over areas; what is tuned for each is a table by it, beside its user.
-        places, count: N, and the number of routes. runs: those of consecutive places of one route. rows,
+        places, count: N, and the number of routes. runs, starts: those of consecutive places of one
+            route, and the first place of each. rows,
             columns: of a plane in which all lie, lattices apart
             from each other; not all rows and columns are places.
 
@@ -111,6 +114,7 @@ class Layout:
             Run(route, *map(sum, zip(*((one.places, one.shown) for one in parts), strict=True)))
             for route, parts in groupby(self.rectangles, lambda one: one.route)
         )
+        self.starts = (*accumulate((run.places for run in self.runs[:-1]), initial=0),)
 
     @classmethod
     def of(
@@ -127,7 +131,9 @@ class Layout:
 
     @classmethod
     def merged(cls, layouts: Sequence[Layout], names: Sequence[Sequence[str]]) -> Layout:
-        """Several layouts one after another, with the names of their routes."""
+        """Several layouts one after another, with the names of their routes, not of other kinds."""
+        kinds = {type(one).__name__ for one in layouts} - {"Layout"}
+        expect(not kinds, "routes or areas", f"a layout {' and '.join(sorted(kinds))} among several")
         count = [*accumulate((one.count for one in layouts), initial=0)]
         rectangles = [
             part._replace(route=part.route + before)
@@ -160,11 +166,6 @@ class Layout:
     def names(self, own: str) -> tuple[str, ...]:
         """Of the routes; `own` of a single one without a name."""
         return self.routes or (own,)
-
-    @property
-    def starts(self) -> tuple[int, ...]:
-        """The first place of each run."""
-        return (*accumulate((run.places for run in self.runs[:-1]), initial=0),)
 
     def places_of(self, route: int) -> int:
         """The number of places of a route."""
@@ -280,7 +281,7 @@ class Layout:
         expect(
             self.fits, "one beside the other", f"{seen}: parts of an area that do not lie beside each other"
         )
-        expect(all(self.routes), "different ones", f"{seen}: names {', '.join(self.routes)}")
+        expect(all(self.routes), "a name for each", f"{seen}: routes {self.routes}")
         wanted = f"those of {' and '.join(f'{rows} x {columns}' for rows, columns in self.extents)}"
         fits = self.dimensions == 1 or [*tiles] == self.tiles[: len(tiles)]
         expect(fits, wanted, f"{seen}: tiles {tiles!s:.100}")
@@ -372,7 +373,7 @@ class Layout:
         if self.dimensions == 1:
             near = self.neighbours(places, min(radius, self.places))
             return (mass.gather(1, near.clamp(min=0)) * (near >= 0)).sum(1).clamp(0, 1)
-        if self.count > 1:
+        if self.count > 1 and radius > GAP:
             routes = self.route_of(torch.arange(self.places, device=mass.device))
             mass = mass * (routes == self.route_of(places)[:, None])
         sums = self.by_place(boxes(self.as_plane(mass), radius)).clamp(0, 1)
@@ -380,17 +381,17 @@ class Layout:
 
     def blurred(self, mass: Tensor, radius: int) -> Tensor:
         """The mass of each place and those up to a radius, with weights that fall with the distance: a
-        triangle along a route, a pyramid over an area, (Q,N) -> (Q,N)."""
-        if not radius:
-            return mass
-        if self._plain:
-            return triangles(mass, radius)
-        if self.count > 1:
-            found = torch.empty_like(mass)
+        triangle along a route, over an area a pyramid of up to `GAP` windows, (Q,N) -> (Q,N)."""
+        if self._plain or not radius:
+            return triangles(mass, radius) if radius else mass
+        if self.dimensions == 1:
+            parts = [*mass.split([run.places for run in self.runs], 1)]
             for route in range(self.count):
-                own = self.places_in(route).to(mass.device)
-                found[:, own] = self.only(route).blurred(mass[:, own], radius)
-            return found
+                own = [i for i, run in enumerate(self.runs) if run.route == route]
+                whole = triangles(torch.cat([parts[i] for i in own], 1), radius)
+                for i, part in zip(own, whole.split([self.runs[i].places for i in own], 1), strict=True):
+                    parts[i] = part
+            return torch.cat(parts, 1)
         half = max(1, radius // 2)  # two boxes make a pyramid, whole also at a border
         padded = F.pad(self.as_plane(mass), 4 * (half,))
         pyramid = boxes(boxes(padded, half), half)[:, half:-half, half:-half]
@@ -569,7 +570,7 @@ class Layout:
 
     def truth(self, distance: float) -> str | None:
         """The ground truth by coordinates within a distance, see `find_ground_truth`; None along a route."""
-        return None if self.dimensions == 1 else f"{self.units}:{distance:g}"
+        return None if self.dimensions == 1 else f"{self.units}:{distance:.15g}"
 
     def expect_route(self, to_be: str, seen: str) -> None:
         """Refuse an area."""
@@ -579,9 +580,9 @@ class Layout:
         """Refuse a route."""
         expect(self.dimensions == 2, to_be, seen)
 
-    def expect_one(self, to_be: str, seen: str = "the map has the routes {}") -> None:
-        """Refuse several routes, whose names are put in what is `seen`."""
-        expect(self.count == 1 and not self.routes, to_be, seen.format(", ".join(self.routes)))
+    def expect_one(self, to_be: str, seen: str = "the map") -> None:
+        """Refuse several routes of what is `seen`."""
+        expect(not self.routes, to_be, f"{seen} has the routes {', '.join(self.routes)}")
 
     def expect_several(self, to_be: str, seen: str) -> None:
         """Refuse a single route without a name."""
@@ -598,8 +599,8 @@ class Layout:
     def same(self, other: Layout) -> bool:
         """Whether the places of another are numbered alike and, if both know their frames, lie where these
         do; of routes, whether it is one too."""
-        if self.dimensions == other.dimensions == 1:
-            return True
+        if self.dimensions == 1 or other.dimensions == 1:
+            return self.dimensions == other.dimensions
         known = bool(self.frame and other.frame)
         mine, yours = (
             [(one.route, one.corner, one[:2], known and one[2:5]) for one in layout.rectangles]
@@ -627,7 +628,8 @@ class Layout:
 
     def number(self, route: str) -> int:
         """The number of a route; an InputError if there is none of this name."""
-        expect(route in self.routes, f"one of {', '.join(self.routes)}", f"there is no route {route!r}")
+        known = f"one of {', '.join(self.routes)}" if self.routes else "none, as the only one has no name"
+        expect(route in self.routes, known, f"there is no route {route!r}")
         return self.routes.index(route)
 
     def showing(self, frames: int) -> Layout:
@@ -735,26 +737,31 @@ class Layout:
     @staticmethod
     def restored(facts: Mapping[str, Any], places: int) -> Layout:
         """The layout of so many places from the results of `stored`."""
-        kind, area = KINDS[facts.get("layout", "Layout")], facts.get("area")
-        named = [(run["name"], run["places"], run["frames"]) for run in facts.get("routes", ())]
-        if area is None and not named:
+        name, area = facts.get("layout", "Layout"), facts.get("area")
+        expect(name in KINDS, f"one of {', '.join(KINDS)}, or its line in `KINDS`", f"a layout {name!r:.40}")
+        kind, routes = KINDS[name], facts.get("routes", [])
+        if area is None and not routes:
             return ROUTE if kind is Layout else kind(places)
-        names = [*dict.fromkeys(name for name, _, _ in named)]
-        runs = [(names.index(name), n, f) for name, n, f in named]
+        names = [*dict.fromkeys(run["name"] for run in routes)]
+        numbers = [names.index(run["name"]) for run in routes]
+        rectangles, ends = [], [0] * len(names)
         if area is None:
-            rectangles, ends = [], [0] * len(names)
-            for route, n, f in runs:
-                corner = ends[route], 0
-                rectangles.append(Rectangle(n, corner=corner, route=route, frames=None if f == n else f))
+            for run, route in zip(routes, numbers, strict=True):
+                n, shown = run["places"], run["frames"]
+                one = Rectangle(n, corner=(ends[route], 0), route=route)
+                rectangles.append(one if shown == n else one._replace(frames=shown))
                 ends[route] += n
             return kind.of(rectangles, "", "", names)
-        rectangles, owners = [], iter([r for r, n, _ in runs for _ in range(n)])
+        last, start = [*accumulate(run["places"] for run in routes)], 0
         for part in area.get("parts", [area]):
             first, right, down = (_pair(part[name]) for name in ("first", "right", "down"))
             top, left = part.get("corner", (0, 0))
-            one = Rectangle(part["rows"], part["columns"], first, right, down, (top, left), next(owners, 0))
-            rectangles.append(one)
-            next(islice(owners, one.places - 1, one.places - 1), None)
+            route = numbers[bisect_right(last, start)] if routes else 0
+            rectangles.append(
+                Rectangle(part["rows"], part["columns"], first, right, down, (top, left), route)
+            )
+            start += rectangles[-1].places
+        expect(0 <= start <= LARGEST, f"up to {LARGEST}", f"{start} windows of an area")
         return kind.of(rectangles, area["unit"], area["frame"], names)
 
 

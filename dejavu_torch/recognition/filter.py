@@ -128,9 +128,12 @@ class PlaceFilter(SequenceModel):
         default."""
         copied = copy.deepcopy(self)
         copied.layout = layout
-        if torch.equal(self.move_logits.cpu().float(), logits(*MOVES[1])):
-            copied.move_logits = nn.Parameter(logits(*MOVES[layout.dimensions]).to(self.off_map.device))
-        if float(self.log_sharpness.detach()) == 0:
+        before, after = MOVES[self.layout.dimensions], MOVES[layout.dimensions]
+        if before == after:
+            return copied
+        if torch.equal(self.move_logits.cpu().float(), logits(*before)):
+            copied.move_logits = nn.Parameter(logits(*after).to(self.off_map))
+        if float(self.log_sharpness.exp()) == SHARPNESS[self.layout.dimensions]:
             copied.log_sharpness.data.fill_(math.log(SHARPNESS[layout.dimensions]))
         return copied
 

@@ -7,9 +7,11 @@ from itertools import pairwise
 
 import pytest
 import torch
+from helpers import refused
 from hypothesis import given
 from hypothesis import strategies as st
 
+from dejavu_torch import PlaceFilter
 from dejavu_torch.places import rectangles
 from dejavu_torch.places.layout import FAR, Layout
 from dejavu_torch.places.rectangles import Rectangle
@@ -96,7 +98,7 @@ def test_places_of_one_route_are_near_by_rows_and_columns_and_no_others(layout, 
     at = every[torch.arange(3) * len(every) // 3]
     torch.testing.assert_close(layout.mass_near(mass, at, radius), (mass * (far[at] <= radius)).sum(1))
     shortest = min(layout.places_of(r) for r in range(layout.count))
-    even = 2 * (min(radius, shortest) // 2)  # a triangle, or pyramid
+    even = 2 * (min(radius, shortest, rectangles.GAP) // 2)  # a triangle, or pyramid
     away = (cells[:, None] - cells).abs() / (even + 1)
     weight = ((1 - away).clamp(min=0).prod(2) * alike).double()
     torch.testing.assert_close(layout.blurred(mass, even), mass @ weight)
@@ -159,3 +161,44 @@ def test_places_that_are_not_of_one_ground_are_never_near(sizes):
             joined.distance(own[:, None], own), one.distance(own[:, None] - start, own - start)
         )
         start += one.places
+
+
+def test_words_of_users_are_no_formats_and_what_does_not_fit_is_told():
+    two = Layout.merged([Layout(3), Layout(4)], [["a"], ["b"]])
+    Layout(3).expect_one("one", "map {0}")
+    with refused("map {0} has the routes a, b", "expected one"):
+        two.expect_one("one", "map {0}")
+    with refused("no route 'c'", "one of a, b"):
+        two.number("c")
+    with refused("no route 'c'", "none"):
+        Layout(3).number("c")
+    with refused("layout 'Foo'", "Layout"):
+        Layout.restored({"layout": "Foo"}, 3)
+    with refused("1099511627776 windows"):
+        stored = Layout(3, 4).stored()
+        Layout.restored({"area": stored["area"] | {"rows": 2**38}}, 12)
+    column = Layout(22, 1, unit="px", frame="pixels")
+    assert not Layout(22).same(column)
+    assert not column.same(Layout(22))
+    assert column.same(column)
+    assert Layout(22).same(Layout(5))
+
+
+@pytest.mark.parametrize("parts", [(0,), (0, 1), (0, 1, 0)])
+def test_a_filter_compiles_on_routes_of_all_kinds(parts):
+    rectangles = [Rectangle(20, corner=(20 * i, 0), route=route) for i, route in enumerate(parts)]
+    layout = Layout.of(rectangles, routes=["a", "b"][: len({*parts})])
+    moved, scores = PlaceFilter().over(layout), torch.rand(3, layout.places)
+    step = torch.compile(
+        lambda rows: moved.step(rows, moved.start(layout.places))[0], backend="eager", fullgraph=True
+    )
+    torch.testing.assert_close(step(scores), moved.step(scores, moved.start(layout.places))[0])
+
+
+def test_a_filter_on_a_route_keeps_what_was_set():
+    given = PlaceFilter().double().requires_grad_(False)
+    there = given.over(Layout(10))
+    assert (there.move_logits.dtype, there.move_logits.requires_grad) == (torch.float64, False)
+    assert given.over(Layout(3, 4)).move_logits.dtype == torch.float64
+    back = given.over(Layout(3, 4)).over(Layout(10))
+    torch.testing.assert_close(back.move_logits, given.move_logits)
