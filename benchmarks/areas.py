@@ -14,16 +14,17 @@ from torch import Tensor
 from benchmarks.front import summarised
 from benchmarks.measure import Row, write_bench
 from benchmarks.quantisers import Quantiser
+from benchmarks.ways import Scoring, in_order, stored_by
 from dejavu_torch import DejaVu, PlaceFilter, PlaceSmoother, SpectralMapper, Whitening
 from dejavu_torch.data.demo import open_area
-from dejavu_torch.evaluation.baselines import as_int8, scores_of_stored, stored_frames
+from dejavu_torch.evaluation.baselines import as_int8, stored_frames
 from dejavu_torch.evaluation.contenders import COLOURS
 from dejavu_torch.evaluation.controls import shuffled
 from dejavu_torch.evaluation.plots import Plot, legend
 from dejavu_torch.evaluation.quantiser import product_quantised
 from dejavu_torch.places.layout import Layout
 from dejavu_torch.recognition.drive import localize_drive
-from dejavu_torch.recognition.localizer import Localizer, Matching, Scoring, drive_query
+from dejavu_torch.recognition.localizer import Localizer, Matching, drive_query
 
 SEEDS = (1, 2, 3)  # of whitening, queries, codebooks and the order of the control; settings were chosen on 0
 STRIDE, QUERIES = 4, 1500  # pixels of 12.5 cm; queries at any offset
@@ -59,26 +60,21 @@ def ways_of(places: Tensor, area: Layout, seed: int) -> Iterator[tuple[str, floa
                 made = SpectralMapper(size, chunk=area.columns)(rows)
             else:
                 made = SpectralMapper(size)(rows, area)
-            where = {"map": None, "null": order.argsort(), "rows": in_rows.argsort()}[key]
-            yield key, made.summary().route_bytes / len(places), in_order(made.scores, where)
+            where = {"map": None, "null": order, "rows": in_rows}[key]
+            yield key, made.summary().route_bytes / len(places), in_order(made, where)
     # codebooks of the other half of the road
     half = area.cells(torch.arange(len(places)))[:, 1] < area.columns // 2
     for code in CODES:
         restored, _ = product_quantised(places, code, seed)
-        yield "product_quantiser", code, scores_of_stored(restored, 1, "cosine")
+        yield "product_quantiser", code, stored_by(restored, area)
         for kind in ("PQ", "RQ"):
             restored = torch.empty_like(places)
             for one, other in ((half, ~half), (~half, half)):
                 restored[one] = Quantiser(places[other], f"{kind}{code}x8")(places[one])
-            yield kind, code, scores_of_stored(restored, 1, "cosine")
+            yield kind, code, stored_by(restored, area)
     kept = len(stored_frames(len(places), SKIPPED, area)[0]) / len(places)
-    yield "stride", kept * places.shape[1], scores_of_stored(as_int8(places), SKIPPED, "cosine", area)
-    yield "uncompressed", 4.0 * places.shape[1], scores_of_stored(places, 1, "cosine")
-
-
-def in_order(score: Scoring, order: Tensor | None) -> Scoring:
-    """Scores with their columns in another order."""
-    return score if order is None else lambda queries: score(queries)[:, order]
+    yield "stride", kept * places.shape[1], stored_by(as_int8(places), area, SKIPPED)
+    yield "uncompressed", 4.0 * places.shape[1], stored_by(places, area)
 
 
 @torch.no_grad()
@@ -97,7 +93,8 @@ def measured(seed: int) -> list[Row]:
     flown = torch.cat([model.descriptor(second[part.tolist()]) for part in path.split(64)])
     rows = []
     for key, size, score in ways_of(places, reference.layout, seed):
-        best = torch.cat([score(part).argmin(1) for part in queries.split(256)])
+        asked_by = score(queries)
+        best = torch.cat([asked_by.rows(part).argmin(1) for part in torch.arange(len(queries)).split(256)])
         if key == "stride":  # of equal scores, the place that is stored
             kept, nearest = stored_frames(len(places), SKIPPED, reference.layout)
             best = kept[nearest[best]]
@@ -106,11 +103,14 @@ def measured(seed: int) -> list[Row]:
         rows.append(row | {"recall_at_1": float(right.double().mean())})
         if key in FLOWN:
             smoother = PlaceSmoother(within=round(RADIUS / STRIDE))
-            found = localize_drive(drive_query(flown, smoother, score, layout=reference.layout))
+            scorer = score(flown)
+            found = localize_drive(drive_query(scorer, smoother))
             right = (where.values[found.index[:, 0]] - own.values[path]).norm(dim=1) <= RADIUS
             sure = found.probability[:, 0] >= 0.5 if found.probability is not None else right
             matcher = Localizer(None, Matching(PlaceFilter()), layout=reference.layout)
-            live = matcher.match(torch.cat([score(part) for part in flown.split(64)])).index
+            live = matcher.match(
+                torch.cat([scorer.rows(part) for part in torch.arange(len(flown)).split(64)])
+            ).index
             on_the_way = (where.values[live] - own.values[path]).norm(dim=1) <= RADIUS
             shares = right, sure & ~right, on_the_way
             rows[-1] |= {key: float(one.double().mean()) for key, one in zip(FLIGHT, shares, strict=True)}

@@ -13,23 +13,21 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from benchmarks.measure import Row, write_bench
+from benchmarks.ways import Scoring, in_order, stored_by
 from dejavu_torch import DejaVu, PlaceSmoother, SpectralMapper, Whitening, open_source
 from dejavu_torch.data.ground_truth import is_right
 from dejavu_torch.evaluation.baselines import (
     as_int8,
-    of_stored,
     quantised_every_kth,
-    scores_of_stored,
-    stored_frames,
     stride_bytes,
 )
 from dejavu_torch.evaluation.contenders import COLOURS
 from dejavu_torch.evaluation.controls import shuffled, with_mapper
 from dejavu_torch.evaluation.curves import evaluate
 from dejavu_torch.evaluation.plots import Plot, legend, show_frame
+from dejavu_torch.places.layout import ROUTE
 from dejavu_torch.recognition.drive import localize_drives
-from dejavu_torch.recognition.localizer import Localizer, Scoring, drive_query
-from dejavu_torch.types import Match
+from dejavu_torch.recognition.localizer import drive_query, match_scores
 
 ROAD = ("demo:road?traverse=0", "demo:road?traverse=1")
 OTHER = "sim:aerial?seed={seed}&size=96"  # another route, to learn codebooks on
@@ -60,12 +58,6 @@ class Way(NamedTuple):
     k: int = 1
     fixed: int = 0
 
-    def match(self, queries: Tensor, places: int) -> Match:
-        """The places of single images, of stored frames only."""
-        matcher, stored = Localizer(), stored_frames(places, self.k)[0]
-        scores = map(self.score, queries.split(512))
-        return Match.joined(matcher.match(of_stored(part, stored)) for part in scores)
-
 
 def ways_of(model: DejaVu, places: Tensor, other: Tensor, seed: int) -> Iterator[Way]:
     """All ways to store descriptors (N,K); `other`: descriptors of another route."""
@@ -75,8 +67,7 @@ def ways_of(model: DejaVu, places: Tensor, other: Tensor, seed: int) -> Iterator
             small = with_mapper(model, SpectralMapper(size))
             small.learn_features(rows)
             taken = small.summary().route_bytes / count
-            score = small.map.scores if key == "map" else small.scores_in(order)
-            yield Way(key, size, taken, score)
+            yield Way(key, size, taken, in_order(small.map, None if key == "map" else order))
         fitted = partial(quantised_every_kth, places, tolerance=TOLERANCE, seed=seed)
         few = [
             fitted(room, centroids=one)
@@ -89,11 +80,11 @@ def ways_of(model: DejaVu, places: Tensor, other: Tensor, seed: int) -> Iterator
         for key, one in found.items():
             counted = key == "product_quantiser_small"
             taken = (one.bytes + one.codebooks * counted) / count
-            score = scores_of_stored(one.restored, one.k, "cosine")
+            score = stored_by(one.restored, ROUTE, one.k)
             yield Way(key, size, taken, score, one.k, one.codebooks * (key == "product_quantiser"))
-    yield Way("uncompressed", 4.0 * width, 4.0 * width, scores_of_stored(places, 1, "cosine"))
+    yield Way("uncompressed", 4.0 * width, 4.0 * width, stored_by(places, ROUTE))
     keys = stride_bytes(count, width, 1, STRIDE) / count
-    yield Way("stride", keys, keys, scores_of_stored(as_int8(places), STRIDE, "cosine"), STRIDE)
+    yield Way("stride", keys, keys, stored_by(as_int8(places), ROUTE, STRIDE), STRIDE)
 
 
 @torch.no_grad()
@@ -108,11 +99,11 @@ def measured(seed: int) -> tuple[list[Row], Tensor, Tensor]:
     truth, rows = torch.arange(len(queries))[:, None], []
     ways = [*ways_of(model, places, other, seed)]
     driven = [way for way in ways if way.key not in ACCOUNTS]
-    asked = [drive_query(queries, PlaceSmoother(within=TOLERANCE), way.score) for way in driven]
+    asked = [drive_query(way.score(queries), PlaceSmoother(within=TOLERANCE)) for way in driven]
     drives = dict(zip(map(id, driven), localize_drives(asked), strict=True))
     answers = hard = torch.empty(0)
     for way in ways:
-        single, drive = way.match(queries, len(places)), drives.get(id(way))
+        single, drive = match_scores(way.score(queries)), drives.get(id(way))
         scores, right = evaluate(single, truth, TOLERANCE), is_right(single.index, truth, TOLERANCE)
         row = {"seed": seed, "contender": way.key, "bytes_per_place": way.room, "taken": way.bytes}
         row |= {"k": way.k, "with_codebooks": way.bytes + way.fixed / len(places), "auc": scores.auc}

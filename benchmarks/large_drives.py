@@ -18,6 +18,7 @@ from dejavu_torch.maps.spectral_map import SpectralMap
 from dejavu_torch.recognition import drive as driving
 from dejavu_torch.recognition.large import is_large
 from dejavu_torch.recognition.localizer import Localizer, Matching
+from dejavu_torch.recognition.scorer import OfMap
 from dejavu_torch.recognition.smoother import PlaceSmoother
 from dejavu_torch.types import Match
 
@@ -86,7 +87,7 @@ def made(task: Task) -> tuple[SpectralMap, Tensor, Tensor]:
         own = truth[(truth >= start) & (truth < start + count)] - start
         queries.append(route[own])
     noise = F.normalize(torch.randn(task.queries, NUMBERS, generator=random))
-    whole = maps[0] if len(maps) == 1 else SpectralMap.merged(maps, [str(i) for i in range(len(maps))])
+    whole = maps[0] if len(maps) == 1 else SpectralMap.merged(maps, [[str(i)] for i in range(len(maps))])
     return whole, F.normalize(torch.cat(queries) + NOISE * noise), truth
 
 
@@ -97,7 +98,9 @@ def measured(task: Task) -> dict[str, Any]:
 
     def whole() -> Match:
         smoother = PlaceSmoother(within=TOLERANCE)
-        return Localizer(place_map, Matching(smoother, radius=TOLERANCE)).drive(queries, smoother)
+        return Localizer(place_map, Matching(smoother, radius=TOLERANCE)).drive(
+            OfMap(place_map, queries), smoother
+        )
 
     def recall(index: Tensor) -> float:
         return float(((index - truth[: len(index)]).abs() <= TOLERANCE).double().mean())

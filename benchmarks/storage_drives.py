@@ -26,9 +26,11 @@ from dejavu_torch.evaluation.report import text_table
 from dejavu_torch.maps.distance import Metric, phase_distances
 from dejavu_torch.maps.spectral import SpectralMapper
 from dejavu_torch.model import DejaVu
+from dejavu_torch.places.layout import Layout
 from dejavu_torch.recognition.centring import centred
 from dejavu_torch.recognition.drive import DriveQuery, localize_drive
 from dejavu_torch.recognition.evidence import place_means, standardised
+from dejavu_torch.recognition.scorer import OfRows
 from dejavu_torch.recognition.select import best_match
 from dejavu_torch.recognition.smoother import PlaceSmoother, rows_of
 from dejavu_torch.types import InputError, Match
@@ -159,7 +161,8 @@ def bench_storage_drives(route: Asked) -> Iterator[Row]:
 def answered(answer: str, scores: Tensor, queries: Tensor, smoother: PlaceSmoother) -> Match:
     """The best place of each query, (Q,N) and (Q,K) -> Match of (Q,)."""
     if answer == "drive":
-        return localize_drive(DriveQuery(rows_of(scores), queries, smoother)).map(lambda column: column[:, 0])
+        scorer = OfRows(rows_of(scores), queries, Layout(scores.shape[1]))
+        return localize_drive(DriveQuery(scorer, smoother)).map(lambda column: column[:, 0])
     return best_match(both_sides(scores) if answer == "window" else scores)
 
 

@@ -13,18 +13,18 @@ from tempfile import TemporaryDirectory
 import torch
 from torch import Tensor
 
-from benchmarks.areas import flight, in_order
+from benchmarks.areas import flight
 from benchmarks.front import summarised
 from benchmarks.measure import Row, write_bench
+from benchmarks.ways import Scoring, in_order, stored_by
 from dejavu_torch import DejaVu, PlaceSmoother, SpectralMapper
 from dejavu_torch.data.simulate.terrain import open_terrain
 from dejavu_torch.data.traverse import Part
-from dejavu_torch.evaluation.baselines import scores_of_stored
 from dejavu_torch.evaluation.controls import shuffled
 from dejavu_torch.features.whitening import Whitening
 from dejavu_torch.places.layout import Layout
 from dejavu_torch.recognition.drive import localize_drive
-from dejavu_torch.recognition.localizer import Scoring, drive_query
+from dejavu_torch.recognition.localizer import drive_query
 
 SEEDS = (1, 2, 3)  # of ground, whitening and queries; settings were chosen on others
 SIZES = (0.3, 1.0, 2.2)  # bytes of the lines per place
@@ -66,9 +66,9 @@ def ways_of(places: Tensor, area: Layout, seed: int) -> Iterator[tuple[str, floa
     for size in SIZES:
         for key, rows in (("map", places), ("null", mixed))[: 1 + (size in FLOWN_AT)]:
             made = SpectralMapper(size)(rows, area)
-            score = in_order(made.scores, order.argsort() if key == "null" else None)
+            score = in_order(made, order if key == "null" else None)
             yield key, size, score
-    yield "uncompressed", 4.0 * places.shape[1], scores_of_stored(places, 1, "cosine")
+    yield "uncompressed", 4.0 * places.shape[1], stored_by(places, area)
 
 
 @torch.no_grad()
@@ -85,10 +85,11 @@ def measured(seed: int, metres: int) -> list[Row]:
     queries, flown = (model.descriptor.all_of(Part(second, one)).float() for one in (asked, path))
     rows: list[Row] = []
     for key, size, score in ways_of(places, area, seed):
-        single = torch.cat([score(part).argmin(1) for part in queries.split(20)])
+        asked_by = score(queries)
+        single = torch.cat([asked_by.rows(part).argmin(1) for part in torch.arange(len(queries)).split(20)])
         found = found_within(single, area, where[asked])
         if size in FLOWN_AT or key == "uncompressed":
-            whole = localize_drive(drive_query(flown, PlaceSmoother(), score, layout=area)).index[:, 0]
+            whole = localize_drive(drive_query(score(flown), PlaceSmoother())).index[:, 0]
             found += found_within(whole, area, where[path])
         row: Row = {"seed": seed, "contender": key, "bytes_per_place": size, "places": len(reference)}
         rows.append(row | dict(zip(FOUND, found, strict=False)))

@@ -11,7 +11,6 @@ from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-import torch
 from torch import Tensor, nn
 from torch.nn.parameter import is_lazy
 
@@ -36,12 +35,12 @@ from dejavu_torch.places.layout import ROUTE, Layout
 from dejavu_torch.recognition.centring import PRIOR, centred, set_apart
 from dejavu_torch.recognition.coarse import searcher
 from dejavu_torch.recognition.filter import PlaceFilter
-from dejavu_torch.recognition.localizer import Localizer, Matching, Scoring, whole
-from dejavu_torch.recognition.search import SCORES_AT_ONCE, Scan, Search, Searcher, check_search
+from dejavu_torch.recognition.localizer import Localizer, Matching, match_scores
+from dejavu_torch.recognition.scorer import OfMap, Reordered
+from dejavu_torch.recognition.search import Scan, Search, Searcher, check_search
 from dejavu_torch.recognition.select import HIGHEST, PROBABLE, Acceptance, check_candidates
 from dejavu_torch.recognition.smoother import PlaceSmoother
 from dejavu_torch.resize import reduced_size
-from dejavu_torch.text import with_progress
 from dejavu_torch.types import Facts, InputError, Match, SequenceModel, Traverse, expect
 
 if TYPE_CHECKING:
@@ -428,19 +427,18 @@ class DejaVu(nn.Module):
             order: (N,) the frame of each place of a shuffled map; the match then counts frames.
         """
         matching = matching if isinstance(matching, Matching) else self.matching(matching)
-        score = None if order is None else self.scores_in(order)
-        localizer, smoother = self.localizer(matching), matching.sequence
+        localizer, smoother, scorer = (
+            self.localizer(matching),
+            matching.sequence,
+            OfMap(self.map, descriptors),
+        )
         if isinstance(smoother, PlaceSmoother):
-            return localizer.drive(descriptors, smoother, score, progress)
-        if score is None:
-            match = localizer(descriptors, progress)
-            late = isinstance(smoother, PlaceFilter) and smoother.lag
-            return Match.joined([match, localizer.finish()]) if late else match
-        matcher = Localizer(None, matching, layout=self.map.layout)
-        parts = descriptors.split(whole(SCORES_AT_ONCE // self.map.places, matching.copies))
-        with torch.no_grad():
-            scores = map(score, with_progress(parts, "localizing", progress))
-            return Match.joined(map(matcher.match, scores))
+            return localizer.drive(scorer if order is None else Reordered(scorer, order), smoother, progress)
+        if order is not None:
+            return match_scores(Reordered(scorer, order), matching, progress)
+        match = localizer(descriptors, progress)
+        late = isinstance(smoother, PlaceFilter) and smoother.lag
+        return Match.joined([match, localizer.finish()]) if late else match
 
     def loops(self, traverse: Source, apart: int = 50, drive: bool = True, progress: bool = False) -> Match:
         """Where a drive comes back to places that it has passed before: the best earlier place of each frame.
@@ -473,12 +471,6 @@ class DejaVu(nn.Module):
         likely = smoother is not None and not single.acceptance.given
         acceptance = self.acceptance(smoother) if likely else single.acceptance
         return single._replace(sequence=smoother, apart=apart, acceptance=acceptance)
-
-    def scores_in(self, order: Tensor) -> Scoring:
-        """The scores of a map whose places are the frames `order`, frame by frame."""
-        device = self.map.device
-        place = order.argsort().to(device)
-        return lambda queries: self.map.scores(queries.to(device))[:, place]
 
     def localizer(self, matching: Matching) -> Localizer:
         """A matcher of descriptors, for consecutive batches of queries."""

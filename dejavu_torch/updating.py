@@ -21,8 +21,8 @@ from dejavu_torch.places.states import Link
 from dejavu_torch.recognition.calibration import TOLERANCE
 from dejavu_torch.recognition.drive import Answers, DriveQuery, answer_drives
 from dejavu_torch.recognition.evidence import spacing_of
+from dejavu_torch.recognition.scorer import OfMap, Scorer, Wrapped
 from dejavu_torch.recognition.smoother import PlaceSmoother
-from dejavu_torch.recognition.taken import ALONE, FAITHFUL, flipped, middle
 from dejavu_torch.teaching import FEWEST, SHARE, SURE, Refinement, described, in_its_light, refined_by
 from dejavu_torch.types import Match, Traverse
 
@@ -198,28 +198,26 @@ def _runs(absent: Tensor, stored: Sequence[Stretch], least: int) -> list[Stretch
     return [(first, last) for first, last in long if float(absent[first:last].mean()) >= SURELY]
 
 
+class Silent(Wrapped):
+    """Scores of queries, of which those in some stretches say nothing."""
+
+    def __init__(self, scorer: Scorer, stretches: Sequence[Stretch]) -> None:
+        super().__init__(scorer)
+        self.silent = torch.zeros(len(scorer), dtype=torch.bool)
+        for first, last in stretches:
+            self.silent[first:last] = True
+
+    def changed(self, scores: Tensor, queries: Tensor) -> Tensor:
+        return torch.where(self.silent[queries, None].to(scores.device), 0, scores)
+
+
 def _answered(
     place_map: PlaceMap, queries: Tensor, stored: Sequence[Stretch], progress: bool
 ) -> tuple[Answers, PlaceSmoother]:
     """What a smoother tells of queries (Q,K), of which those that are stored say nothing."""
-    silent = torch.zeros(len(queries), dtype=torch.bool)
-    for first, last in stored:
-        silent[first:last] = True
-
-    def rows(numbers: Tensor, seed: int | None = None) -> Tensor:
-        asked = queries[numbers.to(queries.device)]
-        if seed is not None:
-            assert isinstance(place_map, SpectralMap)
-            asked = flipped(asked, seed, middle(queries.sum(0), len(queries), place_map.mean))
-        scores = place_map.scores(asked)
-        return torch.where(silent[numbers, None].to(scores.device), 0, scores)
-
-    smoother = PlaceSmoother()
-    smoother.map_links = place_map.connections
-    asked = DriveQuery(rows, queries, smoother, route_starts=place_map.route_starts)
-    faithful = isinstance(place_map, SpectralMap) and place_map.fidelity >= FAITHFUL
-    asked = asked._replace(null=rows) if faithful else asked._replace(least=ALONE)
-    (answers,) = answer_drives([asked], progress)
+    scorer, smoother = Silent(OfMap(place_map, queries), stored), PlaceSmoother()
+    smoother.map_links = scorer.links
+    (answers,) = answer_drives([DriveQuery(scorer, smoother)], progress)
     return answers, smoother
 
 

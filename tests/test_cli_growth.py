@@ -165,7 +165,10 @@ def test_a_visit_is_averaged_into_a_map_that_is_there(folder, tmp_path, capsys):
         ("merge first.safetensors f.safetensors --map f.safetensors", ["f.safetensors is an input"]),
         ("compare a.npy a.npy --map both.safetensors --out e", ["both.safetensors has", "first, other"]),
         ("export both.safetensors --onnx both.onnx", ["routes first, other"]),
-        (f"live both.safetensors {ROUTE} --page 0 --reference {ROUTE}", ["--reference", "routes first, other"]),
+        (
+            f"live both.safetensors {ROUTE} --page 0 --reference {ROUTE}",
+            ["--reference", "first, other"],
+        ),
         ("evaluate r.csv --truth 0 --out e --route first --map both.safetensors", ["r.csv, line 2"]),
     ],
 )

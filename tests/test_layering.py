@@ -27,7 +27,7 @@ ARROWS = {
     "motion": "places text types memory data",
     "learning": "places text types memory data features maps recognition motion",
     "model_file": "text version types memory data features periods maps recognition motion",
-    "model": "places text types resize data features maps recognition motion learning model_file",
+    "model": "places types resize data features maps recognition motion learning model_file",
     "teaching": "types memory data features maps recognition model",
     "growth": "places types data features maps motion recognition learning model_file model teaching",
     "updating": "places types data maps motion recognition model teaching growth",

@@ -19,7 +19,7 @@ from dejavu_torch.features.descriptor import is_ready
 from dejavu_torch.features.hog import HOG
 from dejavu_torch.features.pixels import PatchPixels
 from dejavu_torch.features.preprocess import Preprocess
-from dejavu_torch.maps.distance import Metric, phase_distances
+from dejavu_torch.maps.distance import Metric
 from dejavu_torch.maps.spectral import SpectralMapper
 from dejavu_torch.maps.spectral_map import SpectralMap
 from dejavu_torch.maps.template_map import TemplateMap, TemplateMapper
@@ -28,9 +28,9 @@ from dejavu_torch.model_file import recipe_of
 from dejavu_torch.motion.resampling import ResampledTraverse
 from dejavu_torch.places.layout import ROUTE, Layout
 from dejavu_torch.recognition.drive import DriveQuery, localize_drives
-from dejavu_torch.recognition.localizer import SINGLE, Localizer, Matching, Scoring, drive_query, whole
+from dejavu_torch.recognition.localizer import SINGLE, Matching, drive_query, match_scores
+from dejavu_torch.recognition.scorer import OfMap, OfStored, Reordered
 from dejavu_torch.recognition.smoother import PlaceSmoother
-from dejavu_torch.text import with_progress
 from dejavu_torch.types import InputError, Match, Traverse
 
 if TYPE_CHECKING:  # training needs the HOG baselines without matplotlib
@@ -38,7 +38,6 @@ if TYPE_CHECKING:  # training needs the HOG baselines without matplotlib
 
 log = logging.getLogger("dejavu_torch")
 
-BLOCK_DISTANCES = 2**22  # of Q x N, computed at a time
 ASKED = 1000  # frames, at most, that a stride is chosen by
 SAME_SIZE = 1.02  # times the bytes that a quantiser may take
 INTERPOLATES = {1: True, 2: False}  # between frames, by the dimensions of a layout
@@ -80,37 +79,8 @@ def nearest_frames(
     Returns:
         Match of (Q,). Single queries find stored frames only, sequences also frames between these.
     """
-    parts = query.split(whole(BLOCK_DISTANCES // len(reference), matching.copies))
-    matcher, stored = Localizer(None, matching, layout=layout), stored_frames(len(reference), k, layout)[0]
-    single = matching.sequence is None or matcher.own == 1
-    alone = Localizer(None, matching._replace(sequence=None, also={}), layout=layout)
-    score, found = scores_of_stored(reference, k, metric, layout), []
-    for scores in map(score, with_progress(parts, "baselines", progress)):
-        match = matcher.match(scores)
-        if k > 1 and (single or 1 in match.sequences):  # else another place would be the same stored frame
-            one = alone.match(of_stored(scores, stored))
-            sequences = {T: one if T == 1 else several for T, several in match.sequences.items()}
-            match = replace(one if single else match, sequences=sequences)
-        found.append(match)
-    return replace(Match.joined(found), probability=None)
-
-
-def of_stored(scores: Tensor, stored: Tensor) -> Tensor:
-    """Scores (B,N), +inf but at the places that are stored, (n,)."""
-    between = torch.ones(scores.shape[1], dtype=torch.bool).index_fill(0, stored, False)
-    return scores.masked_fill(between.to(scores.device), math.inf)
-
-
-def scores_of_stored(reference: Tensor, k: int = 1, metric: Metric = "l1", layout: Layout = ROUTE) -> Scoring:
-    """The distances of queries from the nearest stored frame of each place, see `nearest_frames`."""
-    frames, nearest = stored_frames(len(reference), k, layout)
-    stored = reference if k == 1 else reference[frames.to(reference.device)]
-
-    def score(queries: Tensor) -> Tensor:
-        scores = phase_distances(queries.to(stored.device), stored, metric)
-        return scores if k == 1 else scores[:, nearest.to(stored.device)]
-
-    return score
+    scorer = OfStored(reference, query, k, metric, layout)
+    return replace(match_scores(scorer, matching, progress, "baselines"), probability=None)
 
 
 def stored_frames(frames: int, k: int, layout: Layout = ROUTE) -> tuple[Tensor, Tensor]:
@@ -218,7 +188,7 @@ def baselines_of(
         match = run.match_by(
             lambda *how: nearest_frames(stored, how[0], stride, metric, progress, how[1], layout)
         )
-        asked = run.drive_query(scores_of_stored(stored, stride, metric, layout))
+        asked = run.as_drive(OfStored(stored, run.query_features, stride, metric, layout))
         return Baseline(name, match, bytes + fixed + more, k, fixed + more, asked)
 
     size, own = partial(stride_bytes, frames, dimension, layout=layout), reference.element_size()
@@ -278,7 +248,7 @@ def _in_one_byte(run: Localization, one: str, progress: bool) -> dict[str, Basel
         return {}
     match = run.match_by(lambda query, how: small.localize_descriptors(query, how, progress=progress))
     fixed, route = model.summary().fixed_bytes, small.summary().route_bytes
-    asked = run.drive_query(small.map.scores)
+    asked = run.as_drive(OfMap(small.map, run.query_features))
     return {"one_byte": Baseline(f"this map in 1 byte per {one}", match, fixed + route, None, fixed, asked)}
 
 
@@ -291,10 +261,7 @@ def _as_given(run: Localization, each: float, seed: int, one: str, progress: boo
 
     def baseline(name: str, rows: Tensor, bytes: int, k: int = 1, fixed: int = 0) -> Baseline:
         match = nearest_frames(rows, queries, k, "cosine", progress, run.matching)
-        asked = None
-        if run.beside is not None:
-            score = scores_of_stored(rows, k, "cosine")
-            asked = drive_query(queries, run.beside, score, layout=run.model.map.layout)
+        asked = run.as_drive(OfStored(rows, queries, k, "cosine", run.model.map.layout))
         return Baseline(f"your descriptors, {every(k, one)}{name}", match, bytes + fixed, k, fixed, asked)
 
     return {
@@ -322,7 +289,11 @@ def _null_controls(run: Localization, seed: int, one: str, progress: bool) -> di
     def null(name: str, same_plan: bool = False) -> Baseline:
         shuffled, order = null_map(model, run.reference_features, seed, same_plan)
         match = run.match_by(lambda query, how: shuffled.localize_descriptors(query, how, order, progress))
-        return Baseline(f"control: {name}", match, asked=run.drive_query(shuffled.scores_in(order)))
+        return Baseline(
+            f"control: {name}",
+            match,
+            asked=run.as_drive(Reordered(OfMap(shuffled.map, run.query_features), order)),
+        )
 
     foreign = isinstance(model.mapper, TemplateMapper) and model.mapper.periods is None
     if foreign:
@@ -431,8 +402,8 @@ def _described_baselines(
 
     def baseline(name: str, k: int) -> Baseline:
         match = nearest_frames(stored, queries, k, "l1", progress, matching, layout)
-        score = scores_of_stored(stored, k, layout=layout)
-        asked = None if smoother is None else drive_query(queries, smoother, score, layout=layout)
+        scorer = OfStored(stored, queries, k, layout=layout)
+        asked = None if smoother is None else drive_query(scorer, smoother)
         return Baseline(name, match, size(k), k, asked=asked)
 
     return {key: baseline(name, k) for key, (name, k) in names.items()}

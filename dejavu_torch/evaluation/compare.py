@@ -51,6 +51,7 @@ from dejavu_torch.recognition.calibration import TOLERANCE
 from dejavu_torch.recognition.centring import centred, set_apart
 from dejavu_torch.recognition.filter import PlaceFilter
 from dejavu_torch.recognition.localizer import SINGLE, Matching
+from dejavu_torch.recognition.scorer import OfMap
 from dejavu_torch.recognition.select import check_candidates
 from dejavu_torch.recognition.smoother import PlaceSmoother
 from dejavu_torch.types import InputError, Match, SequenceModel, Together, Traverse, expect
@@ -472,7 +473,9 @@ def _other_contenders(
         queries, size = run.described_by(other, progress), other.summary()
         match = other.localize_descriptors(queries, run.matching, progress=progress)
         beside = copy.deepcopy(run.beside)
-        asked = None if beside is None else other.localizer(SINGLE).drive_query(queries, beside)
+        asked = (
+            None if beside is None else other.localizer(SINGLE).drive_query(OfMap(other.map, queries), beside)
+        )
         found[key] = Baseline(name, match, size.map_bytes, None, size.fixed_bytes, asked)
     if not drives:
         found = {key: one if key in DRIVEN else one._replace(asked=None) for key, one in found.items()}

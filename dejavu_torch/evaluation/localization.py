@@ -18,15 +18,8 @@ from dejavu_torch.places.positions import unit_of
 from dejavu_torch.recognition.centring import set_apart
 from dejavu_torch.recognition.drive import DriveQuery
 from dejavu_torch.recognition.filter import PlaceFilter
-from dejavu_torch.recognition.localizer import (
-    SINGLE,
-    Matching,
-    Scoring,
-    best_copies,
-    copies_of,
-    drive_query,
-    earlier,
-)
+from dejavu_torch.recognition.localizer import SINGLE, Matching, drive_query, wrapped
+from dejavu_torch.recognition.scorer import OfMap, Scorer
 from dejavu_torch.recognition.smoother import PlaceSmoother
 from dejavu_torch.types import Match, SequenceModel, Traverse
 
@@ -90,11 +83,9 @@ class Localization(NamedTuple):
             return found
         return replace(match(self.query_features, matching._replace(also={})), sequences=found.sequences)
 
-    def drive_query(self, score: Scoring) -> DriveQuery | None:
-        """The queries as a drive with the scores of another map, if a smoother is compared."""
-        if self.beside is None:
-            return None
-        return drive_query(self.query_features, self.beside, score, self.model.map.layout)
+    def as_drive(self, scorer: Scorer) -> DriveQuery | None:
+        """Queries as a drive with other scores, if a smoother is compared."""
+        return None if self.beside is None else drive_query(scorer, self.beside)
 
     @property
     def coarsest(self) -> int:
@@ -163,10 +154,8 @@ class Localization(NamedTuple):
     @torch.no_grad()
     def scores(self, numbers: Tensor) -> Tensor:
         """Scores of single queries, on the CPU: their indices (B,) -> (B,N)."""
-        place_map, apart = self.model.map, self.matching.apart
-        rows = self.query_features[copies_of(numbers, self.matching.copies)]
-        scores = best_copies(place_map.scores(rows.to(place_map.device)).float().cpu(), self.matching.copies)
-        return scores if apart is None else earlier(scores, numbers, apart)
+        scorer = wrapped(OfMap(self.model.map, self.query_features), self.matching)
+        return scorer.rows(numbers).float().cpu()
 
     def example_query(self, start: int, stop: int) -> tuple[int, list[int]]:
         """A query near the middle of a chunk, and its right places there; without truth the middle query."""

@@ -112,6 +112,17 @@ class PlaceMap(nn.Module, ABC):
         return self.places
 
     @property
+    def mean(self) -> Tensor:
+        """The mean descriptor of all places, (K,); 0 if it is not known."""
+        return torch.zeros(self.dimension, device=self.device)
+
+    @property
+    def fidelity(self) -> float | None:
+        """The share of descriptors of length 1, about the mean of their route, that the map keeps; None of
+        maps that do not keep descriptors."""
+        return None
+
+    @property
     def layout(self) -> Layout:
         return self._layout.reaching(self.places)
 

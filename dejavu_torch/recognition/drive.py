@@ -18,8 +18,9 @@ from dejavu_torch.recognition.calibration import Platt, best_pair, confidence, c
 from dejavu_torch.recognition.evidence import Spacing, spacing_of
 from dejavu_torch.recognition.filter import near_scores
 from dejavu_torch.recognition.flight import place_flight
-from dejavu_torch.recognition.large import TILE, LargeDrive, Tiles, is_large
+from dejavu_torch.recognition.large import TILE, LargeDrive, is_large
 from dejavu_torch.recognition.plane import FLOWN
+from dejavu_torch.recognition.scorer import Scorer
 from dejavu_torch.recognition.select import best_candidates
 from dejavu_torch.recognition.smoother import (
     Drive,
@@ -52,27 +53,20 @@ class DriveQuery(NamedTuple):
     """A drive to match by a smoother, which is fitted to it.
 
     Attributes:
-        rows: scores of queries by their numbers, (B,) -> (B,N). descriptors: (Q,K) of all queries.
-        k: candidates. radius: suppression radius in places.
+        scorer: of all queries. k: candidates. radius: suppression radius in places.
         platt: the calibration of single queries, if there is one.
-        tiles: the scores of `rows` for large maps; None makes them of rows.
-        null: as `rows`, of `flipped` queries, for a seed; without it their order alone tells whether they are
-            a drive, by at least so many nats for each query.
         checks: the drive only checks the answers of single queries: it lowers their probability. Where ground
             repeats, as lane dashes do, a drive alone finds loops that are none.
+        asks: single images say first whether it is a drive of the map at all.
     """
 
-    rows: Rows
-    descriptors: Tensor
+    scorer: Scorer
     smoother: PlaceSmoother
     k: int = 1
     radius: int = 5
-    route_starts: Sequence[int] = (0,)
     platt: Platt | None = None
-    tiles: Tiles | None = None
     checks: bool = False
-    null: Callable[..., Tensor] | None = None
-    least: float = 0.0
+    asks: bool = True
 
     @property
     def answers(self) -> bool:
@@ -81,15 +75,14 @@ class DriveQuery(NamedTuple):
 
     def ask_singly(self, spacing: Spacing) -> None:
         """Leave to the smoother only what single images find as well."""
-        few = float(spacing.weight.sum()) < FEW
-        self.smoother.is_drive &= self.smoother.nats_per_query >= (
-            max(self.least, ALONE) if few else self.least
-        )
-        if self.null is not None and not few:
-            known, apart = self.smoother, self.radius
-            sure = lambda scores: confidence(best_pair(scores, known.layout, apart=apart))  # noqa: E731
-            found = singly(self.rows, self.null, spacing.weight.cpu(), sure)
-            least = SURER[known.layout.dimensions]
+        few, scorer, known = float(spacing.weight.sum()) < FEW, self.scorer, self.smoother
+        least = scorer.least if self.asks else 0.0
+        known.is_drive &= known.nats_per_query >= (max(least, ALONE) if few else least)
+        if self.asks and scorer.null is not None and not few:
+            layout, apart = scorer.layout, self.radius
+            sure = lambda scores: confidence(best_pair(scores, layout, apart=apart))  # noqa: E731
+            found = singly(scorer.rows, scorer.null, spacing.weight.cpu(), sure)
+            least = SURER[layout.dimensions]
             known.singly = found._replace(nats=known.nats_per_query, least=least)
             known.is_drive &= known.singly.stands_out
 
@@ -138,13 +131,13 @@ def answer_drives(drives: Sequence[DriveQuery], progress: bool = False) -> list[
     """
     shown: list[list[Shown]] = [[] for _ in drives]
     several = len(drives) > 1  # of which each takes about as long
-    count = len(drives) if several else sum(len(asked.descriptors) for asked in drives)
-    sizes = [one.rows(torch.arange(min(1, len(one.descriptors)))).shape[1] for one in drives]
-    large = any(is_large(len(one.descriptors), size) for one, size in zip(drives, sizes, strict=True))
-    one_thread = in_one_thread(math.inf if large else 2 * sum(sizes))
+    scorers = [asked.scorer for asked in drives]
+    count = len(drives) if several else sum(map(len, scorers))
+    large = any(is_large(len(one), one.layout.places) for one in scorers)
+    one_thread = in_one_thread(math.inf if large else 2 * sum(one.layout.places for one in scorers))
     unit = "drive" if several else "query"
     with one_thread, progress_of("smoothing", count, progress, unit) as update:
-        for i, seen in _seen(drives, sizes, progress, update if several else lambda _: None):
+        for i, seen in _seen(drives, progress, update if several else lambda _: None):
             shown[i].append(_shown(drives[i], seen))
             update(0 if several else len(seen.scores))
     return [_joined(asked, parts[::-1]) for asked, parts in zip(drives, shown, strict=True)]
@@ -153,8 +146,8 @@ def answer_drives(drives: Sequence[DriveQuery], progress: bool = False) -> list[
 def _shown(asked: DriveQuery, seen: Seen) -> Shown:
     """The answers of some queries."""
     mass, scores, known = seen
-    smoother, queries = asked.smoother, len(asked.descriptors)
-    layout, within = smoother.layout, smoother.within
+    smoother, queries = asked.smoother, len(asked.scorer)
+    layout, within = asked.scorer.layout, smoother.within
     beside = (layout if known is None else ROUTE).reaching(mass.shape[1])  # of the columns
     ranked = scores = scores.masked_fill(scores.isnan(), math.inf)
     if asked.answers:
@@ -196,53 +189,53 @@ def _joined(asked: DriveQuery, parts: list[Shown]) -> Answers:
 
 
 def _seen(
-    drives: Sequence[DriveQuery], sizes: Sequence[int], progress: bool, fitted_one: Callable[[int], object]
+    drives: Sequence[DriveQuery], progress: bool, fitted_one: Callable[[int], object]
 ) -> Iterator[tuple[int, Seen]]:
-    """Fit the smoothers to drives on so many places; then the numbers of the drives with what is seen.
+    """Fit the smoothers to drives; then the numbers of the drives with what is seen.
 
     fitted_one: called with 1 for each drive, when its smoother is fitted.
     """
     spacings: dict[int, Spacing] = {}  # of descriptors that several drives share
     fitted: dict[tuple[int, States, int], list[tuple[int, Drive]]] = {}
-    for i, (asked, places) in enumerate(zip(drives, sizes, strict=True)):
-        rows, descriptors, smoother, _, _, starts, *_ = asked
-        along = _of_windows if is_large(len(descriptors), places) else None
-        if alone := {1: along, 2: _of_flight}[smoother.layout.dimensions]:
+    for i, asked in enumerate(drives):
+        scorer, smoother = asked.scorer, asked.smoother
+        descriptors, layout = scorer.descriptors, scorer.layout
+        along = _of_windows if is_large(len(scorer), layout.places) else None
+        if alone := {1: along, 2: _of_flight}[layout.dimensions]:
             fitted_one(1)
-            yield from ((i, seen) for seen in alone(asked, places, progress))
+            yield from ((i, seen) for seen in alone(asked, progress))
             continue
         spacing = spacings.get(id(descriptors))
         spacing = spacings[id(descriptors)] = spacing_of(descriptors) if spacing is None else spacing
-        smoother.fit(rows, descriptors, starts, spacing)
+        smoother.fit(scorer.rows, descriptors, layout.starts, spacing)
         asked.ask_singly(spacing)
         fitted_one(1)
-        kind = len(descriptors), smoother.states(places, starts), len(smoother.move_logits)
-        fitted.setdefault(kind, []).append((i, smoother.drive(rows, descriptors, spacing)))
+        kind = len(scorer), smoother.states(layout.places, layout.starts), len(smoother.move_logits)
+        fitted.setdefault(kind, []).append((i, smoother.drive(scorer.rows, descriptors, spacing)))
     for (queries, states, _), alike in fitted.items():
         every = len(alike) * queries * states.places <= SCORES_KEPT
         alike = [(i, drive._replace(rows=_kept(drive.rows, every))) for i, drive in alike]
         pairs = [(drives[i].smoother, drive) for i, drive in alike]
-        for block in blocks_together(pairs, drives[alike[0][0]].route_starts):
+        for block in blocks_together(pairs, drives[alike[0][0]].scorer.layout.starts):
             numbers = torch.arange(block.first, block.first + block.log.shape[-1])
             for (i, drive), posterior in zip(alike, block.posterior, strict=True):
                 asked = drives[i]
                 yield i, Seen(_mass(posterior), drive.rows(numbers).cpu())
 
 
-def _of_flight(asked: DriveQuery, places: int, progress: bool) -> Iterator[Seen]:
+def _of_flight(asked: DriveQuery, progress: bool) -> Iterator[Seen]:
     """What is seen of a drive over an area."""
-    spacing, queries = spacing_of(check_descriptors(asked.descriptors)), len(asked.descriptors)
-    mass = place_flight(asked.smoother, asked.rows, queries, asked.smoother.layout, spacing)
+    scorer = asked.scorer
+    spacing, queries = spacing_of(check_descriptors(scorer.descriptors)), len(scorer)
+    mass = place_flight(asked.smoother, scorer.rows, queries, scorer.layout, spacing)
     asked.ask_singly(spacing)
-    yield Seen(mass.double(), asked.rows(torch.arange(queries)).cpu())
+    yield Seen(mass.double(), scorer.rows(torch.arange(queries)).cpu())
 
 
-def _of_windows(asked: DriveQuery, places: int, progress: bool) -> Iterator[Seen]:
+def _of_windows(asked: DriveQuery, progress: bool) -> Iterator[Seen]:
     """What is seen of a drive on a large map."""
-    rows, descriptors, smoother, k, radius, starts, _, tiles, *_ = asked
-    tiles = tiles or Tiles(lambda numbers: iter([(0, rows(numbers))]), places)
-    settings = places, smoother, starts, max(2, k), radius, progress
-    drive = LargeDrive(tiles, descriptors, *settings)
+    scorer, places = asked.scorer, asked.scorer.layout.places
+    drive = LargeDrive(scorer, asked.smoother, max(2, asked.k), asked.radius, progress)
     asked.ask_singly(drive.spacing)
     for first, posterior, scores, known in drive:
         mass = _mass(posterior)
@@ -251,7 +244,7 @@ def _of_windows(asked: DriveQuery, places: int, progress: bool) -> Iterator[Seen
             continue
         for part in reversed(torch.arange(len(mass)).split(max(1, TILE // places))):
             whole = mass.new_zeros(len(part), places).index_copy(1, known, mass[part])
-            yield Seen(whole, rows(first + part).cpu())
+            yield Seen(whole, scorer.rows(first + part).cpu())
 
 
 def _kept(rows: Rows, every: bool) -> Rows:

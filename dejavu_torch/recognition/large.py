@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -11,7 +11,6 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from dejavu_torch.maps.place_map import ScoreBlocks
 from dejavu_torch.recognition.evidence import (
     MIN_SHARE,
     RankTable,
@@ -19,6 +18,7 @@ from dejavu_torch.recognition.evidence import (
     spacing_of,
 )
 from dejavu_torch.recognition.motion import Motion
+from dejavu_torch.recognition.scorer import Scorer
 from dejavu_torch.recognition.smoother import (
     CORRELATED,
     FEWEST_FITTED,
@@ -39,14 +39,6 @@ LOOKED = 2**12  # places of a window that are looked at, at most, and those besi
 WINDOW, MARGIN = 400, 100  # queries that are smoothed at a time, and those on both sides that they depend on
 MEANS = 256  # queries whose mean score of a place is taken
 TILE = 2**22  # numbers at a time
-
-
-class Tiles(NamedTuple):
-    """blocks: numbers of queries (B,) -> blocks of their scores. width: about how many numbers a query has in
-    a block."""
-
-    blocks: Callable[[Tensor], ScoreBlocks]
-    width: int
 
 
 def is_large(queries: int, places: int) -> bool:
@@ -72,29 +64,26 @@ class LargeDrive:
     in groups with a mass above `LIKELY`, and in those beside them; all others are off the map.
 
     Args:
-        tiles: the scores. descriptors: (Q,K) of all queries. candidates, radius: as in `best_candidates`.
+        scorer: of all queries. candidates, radius: as in `best_candidates`.
     """
 
     @torch.no_grad()
     def __init__(
         self,
-        tiles: Tiles,
-        descriptors: Tensor,
-        places: int,
+        scorer: Scorer,
         smoother: PlaceSmoother,
-        route_starts: Sequence[int] = (0,),
         candidates: int = 2,
         radius: int = 5,
         progress: bool = False,
     ) -> None:
-        self.blocks, self.places, self.smoother, self.progress = tiles.blocks, places, smoother, progress
-        self.descriptors, self.queries, self.route_starts = descriptors, len(descriptors), route_starts
-        self.parts = torch.arange(self.queries).split(max(16, TILE // tiles.width))
-        self.spacing = spacing_of(descriptors)
+        self.scorer, self.smoother, self.progress = scorer, smoother, progress
+        self.places, self.queries = scorer.layout.places, len(scorer)
+        self.parts = torch.arange(self.queries).split(max(16, TILE // scorer.width))
+        self.spacing = spacing_of(scorer.descriptors)
         self.group = GROUP
-        while self.queries * places > self.group * HELD:
+        while self.queries * self.places > self.group * HELD:
             self.group *= 2
-        self.states = smoother.states(places, route_starts)
+        self.states = smoother.states(self.places, scorer.layout.starts)
         self.means = self._means()
         self.mean, self.spread, self.speaks = torch.zeros(3, self.queries)
         best = self._pooled()
@@ -108,7 +97,7 @@ class LargeDrive:
         total, share = torch.zeros(2, self.places)
         for part in numbers.split(len(self.parts[0])):
             weight = self.spacing.weight[part].float()
-            for start, scores in self.blocks(part):
+            for start, scores in self.scorer.blocks(part):
                 some, scores = slice(start, start + scores.shape[1]), scores.cpu().float()
                 valid = scores.isfinite()
                 total[some] += weight @ scores.where(valid, 0)
@@ -120,7 +109,7 @@ class LargeDrive:
         """Numbers of queries, and blocks of their scores."""
         with progress_of(verb, self.queries, self.progress, "query") as update:
             for part in self.parts:
-                yield part, ((start, scores.cpu().float()) for start, scores in self.blocks(part))
+                yield part, ((start, scores.cpu().float()) for start, scores in self.scorer.blocks(part))
                 update(len(part))
 
     def _pooled(self) -> Tensor:
@@ -166,18 +155,18 @@ class LargeDrive:
         speed = sum(move * share for move, share in enumerate(fine.prior)) / size
         links = [(one // size, two // size, share / 2) for one, two, share in self.states.links]
         coarse = PlaceSmoother((1 - speed, speed), turn=fine.turn, links=links)
-        starts = sorted({start // size for start in self.route_starts})
+        starts = sorted({start // size for start in self.scorer.layout.starts})
 
         def rows(numbers: Tensor) -> Tensor:
             return best[numbers].float()
 
-        coarse.fit(rows, self.descriptors, starts)
+        coarse.fit(rows, self.scorer.descriptors, starts)
         count = max(1, round(self.queries / WINDOW))
         ends = torch.linspace(0, self.queries, count + 1).round().int().tolist()
         around = [(max(0, a - MARGIN), min(self.queries, b + MARGIN)) for a, b in pairwise(ends)]
         top = torch.zeros(count, best.shape[1])
         with progress_of("searching", self.queries, self.progress, "query") as update:
-            for block in coarse.blocks(coarse.drive(rows, self.descriptors), starts):
+            for block in coarse.blocks(coarse.drive(rows, self.scorer.descriptors), starts):
                 mass = coarse.folded(block.posterior)[:, :-1]
                 for looked, (start, stop) in zip(top, around, strict=True):
                     some = slice(max(0, start - block.first), max(0, stop - block.first))

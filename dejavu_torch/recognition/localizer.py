@@ -14,21 +14,19 @@ import torch
 from torch import Tensor
 
 from dejavu_torch.maps.place_map import PlaceMap
-from dejavu_torch.maps.spectral_map import SpectralMap
 from dejavu_torch.memory import in_one_thread
 from dejavu_torch.places.layout import ROUTE, Layout
 from dejavu_torch.recognition.calibration import TOLERANCE, Platt, Track, best_pair, confidence_of
 from dejavu_torch.recognition.calibration import confidence as confidence_of_pair
 from dejavu_torch.recognition.drive import DriveQuery, first_of, localize_drive
 from dejavu_torch.recognition.filter import PlaceFilter
-from dejavu_torch.recognition.large import Tiles
 from dejavu_torch.recognition.samples import GROUP, RowSearch
+from dejavu_torch.recognition.scorer import BestOf, Earlier, Scorer, earlier, of_stored
 from dejavu_torch.recognition.search import SCORES_AT_ONCE, NmsSpec, Scan, Search, Searcher, num_needed
 from dejavu_torch.recognition.select import Acceptance, accept, best_candidates, best_match
 from dejavu_torch.recognition.sequence import SequenceMatcher
-from dejavu_torch.recognition.smoother import PlaceSmoother, Rows
+from dejavu_torch.recognition.smoother import PlaceSmoother
 from dejavu_torch.recognition.taken import (
-    ALONE,
     AT_FIRST,
     EVERY,
     FAITHFUL,
@@ -67,7 +65,6 @@ class Matching(NamedTuple):
 
 
 SINGLE = Matching()  # each query by itself
-Scoring = Callable[[Tensor], Tensor]  # queries (B,K) -> scores (B,N)
 
 
 class Localizer:
@@ -112,7 +109,7 @@ class Localizer:
         self.lock = threading.RLock()
         self.total: Tensor | None = None  # of the queries so far
         asks = isinstance(sequence, PlaceFilter) and matching.platt is not None and matching.copies == 1
-        if asks and isinstance(place_map, SpectralMap) and place_map.fidelity >= FAITHFUL:
+        if asks and place_map is not None and (place_map.fidelity or 0) >= FAITHFUL:
             self.total = torch.zeros(place_map.dimension)
         # probabilities, each by itself, of queries that a filter has yet to answer
         self.alone = torch.empty(0, dtype=torch.float64)
@@ -170,7 +167,7 @@ class Localizer:
         place_map = self.place_map
         if self.total is None:
             return None
-        assert isinstance(place_map, SpectralMap)
+        assert place_map is not None
         numbers = torch.arange(len(descriptors)) + self.running.queries
         sums = self.total.to(descriptors) + descriptors.nan_to_num(0).cumsum(0)
         means = middle(sums, 1 + numbers.to(sums)[:, None], place_map.mean)
@@ -207,83 +204,37 @@ class Localizer:
         with in_one_thread(scores.shape[1]):
             return Match.joined(map(self._in_sequence, parts, turns))
 
-    def drive(
-        self,
-        descriptors: Tensor,
-        smoother: PlaceSmoother,
-        score: Scoring | None = None,
-        progress: bool = False,
-    ) -> Match:
-        """Match all queries (Q,K) of a drive by a smoother, which is fitted to them; see `localize_drives`.
+    def drive(self, scorer: Scorer, smoother: PlaceSmoother, progress: bool = False) -> Match:
+        """Match all queries of a drive by a smoother, which is fitted to them; see `localize_drives`.
 
         Args:
-            score: scores of queries, (B,K) -> (B,N); None are those of the map.
+            scorer: of the queries, and of all copies of them, see `wrapped`.
         """
-        asked = self.drive_query(descriptors, smoother, score)
+        scorer = wrapped(scorer, self.matching)
+        asked = self.drive_query(scorer, smoother)
         match = localize_drive(asked, progress)
         acceptance = self.matching.acceptance
         # whose scores are distances
         if acceptance.threshold is not None and not smoother.is_drive and not asked.checks:
             acceptance = Acceptance(precision=math.exp(-acceptance.threshold))
         if self.matching.copies > 1:
-            match = replace(match, heading=self._headings(descriptors, match.index, score))
+            each = max(1, SCORES_AT_ONCE // (self.matching.copies * scorer.layout.places))
+            parts = zip(torch.arange(len(scorer)).split(each), match.index.split(each), strict=True)
+            turn = torch.cat([match.index[:0], *(scorer.copy_at(*part) for part in parts)])
+            match = replace(match, heading=self._heading_of(turn, match.index))
         return self._accepted(match, acceptance)
-
-    def _headings(self, descriptors: Tensor, index: Tensor, score: Scoring | None) -> Tensor:
-        """The headings (Q,k) of the copies that are most similar to places (Q,k)."""
-        copies, found, place_map = self.matching.copies, [], self.place_map
-        assert place_map is not None
-        score = score or (lambda rows: place_map.scores(rows.to(place_map.device)))
-        each = whole(SCORES_AT_ONCE // place_map.places, copies)
-        for rows, places in zip(descriptors.split(each), index.split(each // copies), strict=True):
-            scores = score(rows).cpu().view(len(places), copies, -1)
-            at = places.clamp(min=0)[:, None].expand(-1, copies, -1)
-            found.append(self._heading_of(scores.gather(2, at).argmin(1), places))
-        return torch.cat(found) if found else index.float()
 
     def _heading_of(self, turn: Tensor, index: Tensor) -> Tensor:
         """The heading of copies in degrees, NaN where the place `index` is -1."""
         heading = turn * (360 / self.matching.copies) - self.layout.north
         return (heading % 360).float().masked_fill(index < 0, torch.nan)
 
-    def drive_query(
-        self, descriptors: Tensor, smoother: PlaceSmoother, score: Scoring | None = None
-    ) -> DriveQuery:
+    def drive_query(self, scorer: Scorer, smoother: PlaceSmoother) -> DriveQuery:
         """What `drive` matches."""
-        matching, place_map, tiles, copies = self.matching, self.place_map, None, self.matching.copies
-        if score is None:
-            assert place_map is not None
-            device, scores, score_blocks = place_map.device, place_map.scores, place_map.score_blocks
-            score = lambda queries: scores(queries.to(device))  # noqa: E731
-            blocks = lambda numbers: score_blocks(descriptors[numbers].to(device))  # noqa: E731
-            tiles = Tiles(blocks, place_map.block_places)
-
-        smoother.map_links = () if place_map is None else place_map.connections
-        smoother.layout = self.layout
-        smoother.removed = matching.removed
-
-        def rows(queries: Tensor) -> Rows:
-            return lambda numbers: best_copies(score(queries[copies_of(numbers, copies)]), copies)
-
-        def loops(numbers: Tensor) -> Tensor:
-            assert matching.apart is not None
-            found = earlier(score(descriptors[numbers]), numbers, matching.apart)
-            blank = ~descriptors[numbers].any(1, keepdim=True)  # such frames find nothing
-            return found.masked_fill(blank.to(found.device), math.inf)
-
-        settings = (matching.k or 1, matching.radius, self.route_starts, matching.platt)
-        if matching.apart is not None:
-            return DriveQuery(loops, descriptors, smoother, *settings, checks=True)
-
-        def null(numbers: Tensor, seed: int) -> Tensor:
-            assert isinstance(place_map, SpectralMap)
-            mean = middle(descriptors.sum(0), len(descriptors), place_map.mean)
-            return best_copies(score(flipped(descriptors[copies_of(numbers, copies)], seed, mean)), copies)
-
-        own = DriveQuery(rows(descriptors), descriptors[::copies], smoother, *settings, tiles)
-        if tiles is None or not isinstance(place_map, SpectralMap):  # templates repeat along the route
-            return own
-        return own._replace(null=null) if place_map.fidelity >= FAITHFUL else own._replace(least=ALONE)
+        matching = self.matching
+        smoother.map_links, smoother.removed = scorer.links, matching.removed
+        settings = matching.k or 1, matching.radius, matching.platt
+        return DriveQuery(scorer, smoother, *settings, checks=matching.apart is not None)
 
     @torch.no_grad()
     def skip(self, queries: int) -> None:
@@ -386,37 +337,41 @@ class Localizer:
         return self._answer(match, pair)
 
 
-def drive_query(
-    queries: Tensor,
-    smoother: PlaceSmoother,
-    score: Scoring,
-    layout: Layout = ROUTE,
-) -> DriveQuery:
-    """Queries (Q,K) as a drive with scores of any kind, for a smoother like this one; see `Matching`.
-
-    Args:
-        layout: of the places.
-    """
-    matching = Matching(removed=smoother.removed)
-    return Localizer(None, matching, layout=layout).drive_query(queries, copy.deepcopy(smoother), score)
+def wrapped(scorer: Scorer, matching: Matching) -> Scorer:
+    """The scores by which queries are matched, see `Matching.copies` and `apart`."""
+    scorer = BestOf(scorer, matching.copies) if matching.copies > 1 else scorer
+    return scorer if matching.apart is None else Earlier(scorer, matching.apart)
 
 
-def earlier(scores: Tensor, numbers: Tensor, apart: int) -> Tensor:
-    """Scores (B,N) of the places `numbers` (B,) as queries, infinite but for those over `apart` before."""
-    place = torch.arange(scores.shape[1], device=scores.device)
-    return scores.masked_fill(place >= (numbers[:, None] - apart).to(scores.device), math.inf)
+def drive_query(scorer: Scorer, smoother: PlaceSmoother) -> DriveQuery:
+    """Queries as a drive with scores of any kind, for a smoother like this one."""
+    smoother = copy.deepcopy(smoother)
+    smoother.map_links = scorer.links
+    return DriveQuery(scorer, smoother, radius=0, asks=False)
+
+
+@torch.no_grad()
+def match_scores(
+    scorer: Scorer, matching: Matching = SINGLE, progress: bool = False, verb: str = "localizing"
+) -> Match:
+    """The matches of queries by their scores alone. Single ones find places that are `stored`, sequences also
+    those between."""
+    scorer, how = wrapped(scorer, matching), matching._replace(copies=1, apart=None)
+    matcher = Localizer(None, how, layout=scorer.layout)
+    alone = Localizer(None, how._replace(sequence=None, also={}), layout=scorer.layout)
+    single, found = matching.sequence is None or matcher.own == 1, []
+    for part in with_progress(scorer.parts(), verb, progress):
+        scores = scorer.rows(part)
+        match = matcher.match(scores)
+        if scorer.stored is not None and (single or 1 in match.sequences):
+            # else another place would be the same stored frame
+            one = alone.match(of_stored(scores, scorer.stored))
+            sequences = {T: one if T == 1 else several for T, several in match.sequences.items()}
+            match = replace(one if single else match, sequences=sequences)
+        found.append(match)
+    return Match.joined(found)
 
 
 def whole(rows: int, copies: int) -> int:
     """So many rows at a time, but at least one, and all copies of a query together."""
     return max(1, rows // copies) * copies
-
-
-def copies_of(numbers: Tensor, copies: int) -> Tensor:
-    """The rows of queries, (B,) -> (B x copies,)."""
-    return (numbers[:, None] * copies + torch.arange(copies)).flatten()
-
-
-def best_copies(scores: Tensor, copies: int) -> Tensor:
-    """The best score of each place over all copies of a query, (B x copies, N) -> (B,N)."""
-    return scores if copies == 1 else scores.view(-1, copies, scores.shape[1]).amin(1)

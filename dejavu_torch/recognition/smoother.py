@@ -11,7 +11,6 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 from typing_extensions import Self
 
-from dejavu_torch.places.layout import ROUTE
 from dejavu_torch.places.rectangles import window_sums
 from dejavu_torch.places.states import Link, States
 from dejavu_torch.recognition.evidence import (
@@ -183,7 +182,6 @@ class PlaceSmoother(SequenceModel):
         self.within, self.threshold = within, threshold
         self.links, self.loop = tuple(links), loop
         self.map_links: tuple[Link, ...] = ()  # those of the map that a `Localizer` matches to
-        self.layout = ROUTE  # of that map's places
         self.removed = 1.0  # share of each place's mean score that is removed
         self.log_likelihood: float | None = None  # nats above being off the map throughout, as fitted
         self.nats_per_query = 0.0  # likewise, with rare jumps, as if queries did not depend on each other

@@ -17,6 +17,7 @@ from dejavu_torch.evaluation.baselines import (
 from dejavu_torch.evaluation.quantiser import product_quantised
 from dejavu_torch.places.layout import Layout
 from dejavu_torch.recognition.localizer import Matching
+from dejavu_torch.recognition.scorer import OfStored
 from dejavu_torch.recognition.sequence import SequenceMatcher
 
 DISTANCES = {
@@ -39,7 +40,7 @@ def literal_nearest(reference, query, k, metric):
 @pytest.fixture
 def _parts(monkeypatch):
     """A few distances at a time."""
-    monkeypatch.setattr("dejavu_torch.evaluation.baselines.BLOCK_DISTANCES", 20)
+    monkeypatch.setattr(OfStored, "at_once", 20)
 
 
 @pytest.mark.usefixtures("_parts")

@@ -13,10 +13,12 @@ from dejavu_torch import DejaVu, Whitening, open_source
 from dejavu_torch.data.traverse import fitted
 from dejavu_torch.evaluation.curves import evaluate
 from dejavu_torch.motion.resampling import ground_truth_of
+from dejavu_torch.places.layout import Layout
 from dejavu_torch.recognition import drive as driving
 from dejavu_torch.recognition import smoother as smoothing
 from dejavu_torch.recognition.calibration import Platt, confidence_of
 from dejavu_torch.recognition.drive import DriveQuery, doubt, localize_drive, localize_drives
+from dejavu_torch.recognition.scorer import OfRows
 from dejavu_torch.recognition.smoother import PlaceSmoother
 
 PLATT = Platt(3.0, 0.5)
@@ -24,8 +26,12 @@ PLATT = Platt(3.0, 0.5)
 
 def localized(scores, smoother, k=1, platt=None):
     """Of scores of which some are asked for at a time."""
-    drive = noise(len(scores), 16, seed=8)
-    return localize_drive(DriveQuery(smoothing.rows_of(scores), drive, smoother, k, 4, platt=platt))
+    scorer = by_rows(smoothing.rows_of(scores), noise(len(scores), 16, seed=8), scores.shape[1])
+    return localize_drive(DriveQuery(scorer, smoother, k, 4, platt=platt))
+
+
+def by_rows(rows, descriptors, places=80):
+    return OfRows(rows, descriptors, Layout(places))
 
 
 def test_an_answer_has_the_most_mass_around_it():
@@ -132,8 +138,8 @@ def test_drives_are_matched_together_as_each_by_itself():
     links = ((64, 5, 0.5),)
 
     def asked():
-        rows = map(smoothing.rows_of, scores)
-        drives = [DriveQuery(one, descriptors, PlaceSmoother(within=3), 2, 4, platt=PLATT) for one in rows]
+        asked = [by_rows(smoothing.rows_of(one), descriptors, one.shape[1]) for one in scores]
+        drives = [DriveQuery(one, PlaceSmoother(within=3), 2, 4, platt=PLATT) for one in asked]
         linked = PlaceSmoother(links=links)
         return [
             *drives,
@@ -165,8 +171,8 @@ def test_scores_are_computed_once_if_they_can_be_kept(kept, monkeypatch):
 
     smoother, descriptors = PlaceSmoother().fit(rows, noise(70, 16, seed=8)), noise(70, 16, seed=8)
     fitted = asked.clone()
-    expected = localize_drive(DriveQuery(smoothing.rows_of(scores), descriptors, PlaceSmoother()))
-    found = localize_drive(DriveQuery(rows, descriptors, PlaceSmoother()))
+    expected = localize_drive(DriveQuery(by_rows(smoothing.rows_of(scores), descriptors), PlaceSmoother()))
+    found = localize_drive(DriveQuery(by_rows(rows, descriptors), PlaceSmoother()))
     assert smoother.is_drive
     assert torch.equal(found.index, expected.index)
     assert int((asked - 2 * fitted)[1:].max()) == (1 if kept else 2)
@@ -214,8 +220,8 @@ def test_a_device_finds_what_the_cpu_finds(clear):
     scores, descriptors = shown(20, range(16), clear=clear).double(), noise(16, 4)
 
     def found(scores, descriptors):
-        rows = smoothing.rows_of(scores)
-        return localize_drive(DriveQuery(rows, descriptors, PlaceSmoother(MOVES), 2, 4, platt=PLATT))
+        scorer = by_rows(smoothing.rows_of(scores), descriptors, scores.shape[1])
+        return localize_drive(DriveQuery(scorer, PlaceSmoother(MOVES), 2, 4, platt=PLATT))
 
     expected = found(scores, descriptors)
     with pretend() as device:

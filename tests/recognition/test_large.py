@@ -10,32 +10,47 @@ import torch.nn.functional as F
 from test_smoother import noise, shown
 
 from dejavu_torch.maps.spectral import SpectralMapper
+from dejavu_torch.places.layout import Layout
+from dejavu_torch.places.rectangles import Rectangle
 from dejavu_torch.places.states import States
 from dejavu_torch.recognition import drive as driving
 from dejavu_torch.recognition import large
 from dejavu_torch.recognition.drive import DriveQuery, localize_drive
-from dejavu_torch.recognition.large import LargeDrive, Tiles, is_large
+from dejavu_torch.recognition.large import LargeDrive, is_large
 from dejavu_torch.recognition.localizer import Localizer, Matching
 from dejavu_torch.recognition.motion import Motion, Rates
+from dejavu_torch.recognition.scorer import OfMap, OfRows
 from dejavu_torch.recognition.smoother import PlaceSmoother
+
+
+class InBlocks(OfRows):
+    """Scores of which some places are computed at a time."""
+
+    def blocks(self, queries):
+        for start in range(0, self.layout.places, 70):
+            yield start, self.rows(queries)[:, start : start + 70]
+
+    @property
+    def width(self):
+        return 2**18
+
+
+def by_rows(scores, descriptors):
+    return OfRows(scores.__getitem__, descriptors, Layout(scores.shape[1]))
 
 
 def both(scores, monkeypatch, starts=(0,), **settings):
     """Matches by the smoother of all places, and coarse to fine with scores of a few places at a time."""
 
-    def blocks(numbers):
-        for start in range(0, scores.shape[1], 70):
-            yield start, scores[numbers, start : start + 70]
-
-    found = []
+    ends = (*starts[1:], scores.shape[1])
+    parts = [Rectangle(end - start, route=i) for i, (start, end) in enumerate(zip(starts, ends, strict=True))]
+    layout, found = Layout.of(parts), []
     queries = noise(len(scores), 16, seed=8)
     for coarse in (False, True):
         monkeypatch.setattr(driving, "is_large", lambda *_, answer=coarse: answer)
         smoother = PlaceSmoother(within=3)
-        tiles, rows = Tiles(blocks, 2**18), scores.__getitem__
-        match = localize_drive(
-            DriveQuery(rows, queries, smoother, radius=4, route_starts=starts, tiles=tiles, **settings)
-        )  # type: ignore[arg-type]
+        scorer = InBlocks(scores.__getitem__, queries, layout)
+        match = localize_drive(DriveQuery(scorer, smoother, radius=4, **settings))  # type: ignore[arg-type]
         found.append((match, smoother))
     (one, first), (two, second) = found
     return one, two, first, second
@@ -76,9 +91,7 @@ def test_answers_are_those_of_all_places(name, monkeypatch):
 def test_only_likely_places_are_looked_at(monkeypatch):
     monkeypatch.setattr(large, "WINDOW", 100)
     scores = shown(4000, range(1008, 1408), clear=9.0)
-    drive = LargeDrive(
-        Tiles(lambda numbers: iter([(0, scores[numbers])]), 4000), noise(400, 8), 4000, PlaceSmoother()
-    )
+    drive = LargeDrive(by_rows(scores, noise(400, 8)), PlaceSmoother())
     assert len(drive.windows) == 4
     for window in drive.windows:
         assert window.stop - window.start <= 300
@@ -100,8 +113,7 @@ def test_no_drive_looks_at_more_places_than_it_may(kind, monkeypatch):
         scores[:] = math.nan
     else:
         scores[:, 40:] = math.inf
-    tiles = Tiles(lambda numbers: iter([(0, scores[numbers])]), 4000)
-    drive = LargeDrive(tiles, noise(300, 8), 4000, PlaceSmoother(), candidates=4, radius=10**4)
+    drive = LargeDrive(by_rows(scores, noise(300, 8)), PlaceSmoother(), candidates=4, radius=10**4)
     assert not drive.smoother.is_drive
     assert all(0 < len(window.places) <= 3 * 320 for window in drive.windows)
     assert [len(own) for _, own, *_ in drive] == [100, 100, 100]
@@ -110,16 +122,14 @@ def test_no_drive_looks_at_more_places_than_it_may(kind, monkeypatch):
 def test_a_drive_is_fitted_to_no_more_queries_than_it_may():
     walk = F.avg_pool1d(noise(4039, 4, seed=1).T[None], 40, 1)[0].T  # few are independent
     scores = noise(4000, 300)
-    drive = LargeDrive(Tiles(lambda numbers: iter([(0, scores[numbers])]), 300), walk, 300, PlaceSmoother())
+    drive = LargeDrive(by_rows(scores, walk), PlaceSmoother())
     assert drive.spacing.correlation > 5
     assert 500 < sum(drive._fitted().values()) <= 1000
 
 
 def test_scores_of_windows_are_those_that_were_given(monkeypatch):
     scores = shown(300, range(20, 280))
-    drive = LargeDrive(
-        Tiles(lambda numbers: iter([(0, scores[numbers])]), 300), noise(260, 8), 300, PlaceSmoother()
-    )
+    drive = LargeDrive(by_rows(scores, noise(260, 8)), PlaceSmoother())
     for first, posterior, own, places in drive:
         assert torch.allclose(posterior.sum(1), torch.ones(len(posterior)), atol=1e-5)
         assert torch.allclose(own, scores[first : first + len(own)][:, places], atol=0.01)
@@ -187,7 +197,7 @@ def test_few_bytes_are_placed_as_by_all_places(room, monkeypatch):
     for coarse in (False, True):
         monkeypatch.setattr(driving, "is_large", lambda *_, answer=coarse: answer)
         smoother = PlaceSmoother(within=5)
-        match = Localizer(learned, Matching(smoother, radius=5)).drive(asked, smoother)
+        match = Localizer(learned, Matching(smoother, radius=5)).drive(OfMap(learned, asked), smoother)
         assert smoother.is_drive
         found.append(float(((match.index - truth).abs() <= 5).double().mean()))
     assert found[1] > 0.95
