@@ -36,7 +36,7 @@ from dejavu_torch.recognition.centring import PRIOR, centred, set_apart
 from dejavu_torch.recognition.coarse import searcher
 from dejavu_torch.recognition.filter import PlaceFilter
 from dejavu_torch.recognition.localizer import Localizer, Matching, match_scores
-from dejavu_torch.recognition.scorer import OfMap, Reordered
+from dejavu_torch.recognition.scorer import OfMap, Scorer
 from dejavu_torch.recognition.search import Scan, Search, Searcher, check_search
 from dejavu_torch.recognition.select import HIGHEST, PROBABLE, Acceptance, check_candidates
 from dejavu_torch.recognition.smoother import PlaceSmoother
@@ -417,25 +417,24 @@ class DejaVu(nn.Module):
         self,
         descriptors: Tensor,
         matching: Matching | SequenceModel | None = None,
-        order: Tensor | None = None,
+        wrapped: Callable[[Scorer], Scorer] | None = None,
         progress: bool = False,
     ) -> Match:
         """As `localize`, for descriptors (Q,K), whitened if the model whitens.
 
         Args:
             matching: a Matching, or a sequence; None matches each query by itself. progress: see `learn`.
-            order: (N,) the frame of each place of a shuffled map; the match then counts frames.
+            wrapped: changes the scores before they are matched, such as `partial(Reordered, order=order)` of
+                a shuffled map, whose match then counts frames.
         """
         matching = matching if isinstance(matching, Matching) else self.matching(matching)
-        localizer, smoother, scorer = (
-            self.localizer(matching),
-            matching.sequence,
-            OfMap(self.map, descriptors),
-        )
+        localizer, smoother = self.localizer(matching), matching.sequence
+        scorer: Scorer = OfMap(self.map, descriptors)
+        scorer = scorer if wrapped is None else wrapped(scorer)
         if isinstance(smoother, PlaceSmoother):
-            return localizer.drive(scorer if order is None else Reordered(scorer, order), smoother, progress)
-        if order is not None:
-            return match_scores(Reordered(scorer, order), matching, progress)
+            return localizer.drive(scorer, smoother, progress)
+        if wrapped is not None or matching.apart is not None:
+            return match_scores(scorer, matching, progress)
         match = localizer(descriptors, progress)
         late = isinstance(smoother, PlaceFilter) and smoother.lag
         return Match.joined([match, localizer.finish()]) if late else match

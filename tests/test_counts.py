@@ -74,8 +74,8 @@ RUNS = {  # searched, scored, moved, described
     "single": (localized(lambda: None), (150, 0, 0, 451)),
     "filter": (localized(PlaceFilter), (0, 150, 150, 451)),
     "drive": (localized(PlaceSmoother), (0, 1053, 1192, 451)),
-    "compare": (compared(*ROUTE, "0"), (300, 2857, 12678, 903)),
-    "compare of an area": (compared(*AREA, None), (116, 1404, 944, 765)),
+    "compare": (compared(*ROUTE, "0"), (150, 3004, 12678, 903)),
+    "compare of an area": (compared(*AREA, None), (58, 1576, 944, 765)),
 }
 
 

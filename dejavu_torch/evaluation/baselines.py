@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, NamedTuple
@@ -27,9 +27,9 @@ from dejavu_torch.model import DejaVu
 from dejavu_torch.model_file import recipe_of
 from dejavu_torch.motion.resampling import ResampledTraverse
 from dejavu_torch.places.layout import ROUTE, Layout
-from dejavu_torch.recognition.drive import DriveQuery, localize_drives
+from dejavu_torch.recognition.drive import localize_drives
 from dejavu_torch.recognition.localizer import SINGLE, Matching, drive_query, match_scores
-from dejavu_torch.recognition.scorer import OfMap, OfStored, Reordered
+from dejavu_torch.recognition.scorer import OfMap, OfStored, Reordered, Scorer
 from dejavu_torch.recognition.smoother import PlaceSmoother
 from dejavu_torch.types import InputError, Match, Traverse
 
@@ -44,19 +44,47 @@ INTERPOLATES = {1: True, 2: False}  # between frames, by the dimensions of a lay
 
 
 class Baseline(NamedTuple):
-    """The matches of another way to store the route.
+    """Another way to store the route.
 
-    name: for tables. bytes: in all. k: the stride, if every k-th frame is stored. fixed: the part of the
-    bytes that does not grow with the route, such as a backbone. asked: the same queries as a drive, for
-    `localize_drives`, if a smoother is compared.
+    name: for tables. scorer: of the same queries. bytes: in all. k: the stride, if every k-th frame is
+    stored. fixed: the part of the bytes that does not grow with the route, such as a backbone. found: the
+    matches, where scores do not tell them. asks: see `DriveQuery`.
     """
 
     name: str
-    found: Match
+    scorer: Scorer | None
     bytes: int | None = None
     k: int | None = None
     fixed: int = 0
-    asked: DriveQuery | None = None
+    found: Match | None = None
+    asks: bool = False
+
+
+def matches_of(
+    baselines: Mapping[str, Baseline],
+    matching: Matching = SINGLE,
+    smoother: PlaceSmoother | None = None,
+    driven: Collection[str] = (),
+    progress: bool = False,
+) -> dict[str, Match]:
+    """The matches of baselines, and of those that are `driven` those of a smoother, all in one pass."""
+    found = dict[str, Match]()
+    for key, one in baselines.items():
+        if one.found is not None:
+            found[key] = one.found
+        elif one.scorer is not None:
+            found[key] = replace(match_scores(one.scorer, matching, progress, "baselines"), probability=None)
+    if smoother is None:
+        return found
+    asked = {
+        key: drive_query(one.scorer, smoother, one.asks)
+        for key, one in baselines.items()
+        if one.scorer is not None and key in driven
+    }
+    for key, drive in zip(asked, localize_drives([*asked.values()], progress), strict=True):
+        best = drive.map(lambda column: column[:, 0])
+        found[key] = replace(found[key], sequences={**found[key].sequences, "smoother": best})
+    return found
 
 
 def nearest_frames(
@@ -173,7 +201,7 @@ def baselines_of(
         leave_out: also query the reference with itself, see `leave_out_match`; single queries.
         progress: show progress bars on a terminal.
     """
-    model, reference, matching = run.model, run.reference_features, run.matching
+    model, reference = run.model, run.reference_features
     layout = model.map.layout
     spectral = isinstance(model.map, SpectralMap)
     one = "place" if len(model.map.positions) else layout.noun
@@ -185,16 +213,13 @@ def baselines_of(
         metric = "cosine"
 
     def nearest(name: str, stored: Tensor, k: int, bytes: int, stride: int = 1, more: int = 0) -> Baseline:
-        match = run.match_by(
-            lambda *how: nearest_frames(stored, how[0], stride, metric, progress, how[1], layout)
-        )
-        asked = run.as_drive(OfStored(stored, run.query_features, stride, metric, layout))
-        return Baseline(name, match, bytes + fixed + more, k, fixed + more, asked)
+        scorer = run.scorer_by(lambda queries: OfStored(stored, queries, stride, metric, layout))
+        return Baseline(name, scorer, bytes + fixed + more, k, fixed + more)
 
     size, own = partial(stride_bytes, frames, dimension, layout=layout), reference.element_size()
     if spectral:
         short, name, strided = as_int8(reference), "its descriptors", f"{every(coarsest, one)}, int8"
-        found = _in_one_byte(run, one, progress) if summary.route_bytes >= 1.5 * frames else {}
+        found = _in_one_byte(run, one) if summary.route_bytes >= 1.5 * frames else {}
         found["uncompressed"] = nearest(f"{name}, {every(1, one)}, float", reference, 1, size(4, 1))
         if is_ready(run.reference):
             found = _as_given(run, summary.route_bytes / frames, seed, one, progress) | found
@@ -219,24 +244,24 @@ def baselines_of(
         }
         found = {key: nearest(name, reference, k, size(own, k), k) for key, (name, k) in names.items()}
 
-    found |= _null_controls(run, seed, one, progress)
+    found |= _null_controls(run, seed, one)
     if leave_out is not None:
         itself = leave_out_match(model, reference, leave_out)
         itself = replace(itself, accepted=itself.score.isfinite())
-        found["leave_out"] = Baseline(f"reference on itself, +-{leave_out} left out", itself)
+        found["leave_out"] = Baseline(f"reference on itself, +-{leave_out} left out", None, found=itself)
     pair, batch = (run.reference, run.asked), model.batch_size
     if not _is_plain_hog(model):
         same = recipe_of(model.preprocess) == recipe_of(Preprocess())
         known = [model.descriptor.hog_of(traverse) for traverse in pair] if same else []
-        found |= hog_baselines(*pair, batch, run.coarsest // 2, progress, matching, run.beside, known)
+        found |= hog_baselines(*pair, batch, run.coarsest // 2, progress, known)
     if run.sequence is not None:  # SeqSLAM compares the grey pixels of small frames by L1
         plain = DejaVu(PatchPixels(), "none", batch_size=batch, preprocess=Preprocess("grey"))
         names = {"seqslam": ("SeqSLAM's pixels: grey, patches normalised", 1)}
-        found |= _described_baselines(plain, names, pair, progress, matching, run.beside)
+        found |= _described_baselines(plain, names, pair, progress)
     return found
 
 
-def _in_one_byte(run: Localization, one: str, progress: bool) -> dict[str, Baseline]:
+def _in_one_byte(run: Localization, one: str) -> dict[str, Baseline]:
     """The run's map coded in one route byte per place, if that can be met."""
     model, place_map = run.model, run.model.map
     assert isinstance(place_map, SpectralMap)
@@ -246,10 +271,9 @@ def _in_one_byte(run: Localization, one: str, progress: bool) -> dict[str, Basel
         small.learn_features(run.reference_features, layout=place_map.layout)
     except InputError:  # less than the mean takes
         return {}
-    match = run.match_by(lambda query, how: small.localize_descriptors(query, how, progress=progress))
     fixed, route = model.summary().fixed_bytes, small.summary().route_bytes
-    asked = run.as_drive(OfMap(small.map, run.query_features))
-    return {"one_byte": Baseline(f"this map in 1 byte per {one}", match, fixed + route, None, fixed, asked)}
+    scorer = run.scorer_by(partial(OfMap, small.map))
+    return {"one_byte": Baseline(f"this map in 1 byte per {one}", scorer, fixed + route, None, fixed)}
 
 
 def _as_given(run: Localization, each: float, seed: int, one: str, progress: bool) -> dict[str, Baseline]:
@@ -260,9 +284,8 @@ def _as_given(run: Localization, each: float, seed: int, one: str, progress: boo
     restored, k, taken, books, _ = quantised_every_kth(stored, each, run.coarsest // 2, seed=seed)
 
     def baseline(name: str, rows: Tensor, bytes: int, k: int = 1, fixed: int = 0) -> Baseline:
-        match = nearest_frames(rows, queries, k, "cosine", progress, run.matching)
-        asked = run.as_drive(OfStored(rows, queries, k, "cosine", run.model.map.layout))
-        return Baseline(f"your descriptors, {every(k, one)}{name}", match, bytes + fixed, k, fixed, asked)
+        scorer = OfStored(rows, queries, k, "cosine", run.model.map.layout)
+        return Baseline(f"your descriptors, {every(k, one)}{name}", scorer, bytes + fixed, k, fixed)
 
     return {
         "exact": baseline(", exact cosine", stored, stored.nbytes),
@@ -270,30 +293,15 @@ def _as_given(run: Localization, each: float, seed: int, one: str, progress: boo
     }
 
 
-def with_drives(found: Mapping[str, Baseline], progress: bool = False) -> dict[str, Baseline]:
-    """Baselines with the answers of a smoother, all in one pass."""
-    asked = {key: one.asked for key, one in found.items() if one.asked is not None}
-    matches, smoothed = localize_drives([*asked.values()], progress), dict(found)
-    for key, drive in zip(asked, matches, strict=True):
-        best, match = drive.map(lambda column: column[:, 0]), found[key].found
-        match = replace(match, sequences={**match.sequences, "smoother": best})
-        smoothed[key] = found[key]._replace(found=match, asked=None)
-    return smoothed
-
-
-def _null_controls(run: Localization, seed: int, one: str, progress: bool) -> dict[str, Baseline]:
+def _null_controls(run: Localization, seed: int, one: str) -> dict[str, Baseline]:
     """Maps of the same frames in random order; `one` is the word for a place."""
     model, spectral = run.model, isinstance(run.model.map, SpectralMap)
     found = {}
 
     def null(name: str, same_plan: bool = False) -> Baseline:
         shuffled, order = null_map(model, run.reference_features, seed, same_plan)
-        match = run.match_by(lambda query, how: shuffled.localize_descriptors(query, how, order, progress))
-        return Baseline(
-            f"control: {name}",
-            match,
-            asked=run.as_drive(Reordered(OfMap(shuffled.map, run.query_features), order)),
-        )
+        scorer = run.scorer_by(lambda queries: Reordered(OfMap(shuffled.map, queries), order))
+        return Baseline(f"control: {name}", scorer)
 
     foreign = isinstance(model.mapper, TemplateMapper) and model.mapper.periods is None
     if foreign:
@@ -362,8 +370,6 @@ def hog_baselines(
     batch_size: int,
     tolerance: int,
     progress: bool = False,
-    matching: Matching = SINGLE,
-    smoother: PlaceSmoother | None = None,
     known: Sequence[Tensor | None] = (),
 ) -> dict[str, Baseline]:
     """HOG of all frames and of every k-th, k = 2 x tolerance, by L1; empty if HOG cannot be computed.
@@ -374,7 +380,7 @@ def hog_baselines(
     strides = {"hog": 1, "hog_stride_coarsest": max(1, 2 * tolerance)}
     names = {key: (f"HOG, {every(k, one)}", k) for key, k in strides.items()}
     plain = DejaVu(whitening="none", batch_size=batch_size)
-    return _described_baselines(plain, names, (reference, query), progress, matching, smoother, known)
+    return _described_baselines(plain, names, (reference, query), progress, known)
 
 
 def _described_baselines(
@@ -382,8 +388,6 @@ def _described_baselines(
     names: Mapping[str, tuple[str, int]],
     traverses: tuple[Traverse, Traverse],
     progress: bool,
-    matching: Matching,
-    smoother: PlaceSmoother | None,
     known: Sequence[Tensor | None] = (),
 ) -> dict[str, Baseline]:
     """Baselines by L1 that store every k-th reference frame, described by `plain`."""
@@ -401,10 +405,7 @@ def _described_baselines(
     size = partial(stride_bytes, len(stored), stored.shape[1], stored.element_size(), layout=layout)
 
     def baseline(name: str, k: int) -> Baseline:
-        match = nearest_frames(stored, queries, k, "l1", progress, matching, layout)
-        scorer = OfStored(stored, queries, k, layout=layout)
-        asked = None if smoother is None else drive_query(scorer, smoother)
-        return Baseline(name, match, size(k), k, asked=asked)
+        return Baseline(name, OfStored(stored, queries, k, layout=layout), size(k), k)
 
     return {key: baseline(name, k) for key, (name, k) in names.items()}
 

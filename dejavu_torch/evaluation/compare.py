@@ -28,7 +28,7 @@ from dejavu_torch.data.ground_truth import (
 from dejavu_torch.data.source import Source, as_traverse
 from dejavu_torch.data.traverse import fitted, kept
 from dejavu_torch.data.turning import Turned, facing_north
-from dejavu_torch.evaluation.baselines import Baseline, baselines_of, with_drives
+from dejavu_torch.evaluation.baselines import Baseline, baselines_of, matches_of
 from dejavu_torch.evaluation.contenders import Contender, contend, models_beside
 from dejavu_torch.evaluation.evaluate import RANKS
 from dejavu_torch.evaluation.facts import facts_of, match_facts, metric_facts, peak_memory
@@ -50,8 +50,8 @@ from dejavu_torch.places.layout import Layout, Reach
 from dejavu_torch.recognition.calibration import TOLERANCE
 from dejavu_torch.recognition.centring import centred, set_apart
 from dejavu_torch.recognition.filter import PlaceFilter
-from dejavu_torch.recognition.localizer import SINGLE, Matching
-from dejavu_torch.recognition.scorer import OfMap
+from dejavu_torch.recognition.localizer import Matching
+from dejavu_torch.recognition.scorer import OfMap, Scorer
 from dejavu_torch.recognition.select import check_candidates
 from dejavu_torch.recognition.smoother import PlaceSmoother
 from dejavu_torch.types import InputError, Match, SequenceModel, Together, Traverse, expect
@@ -67,6 +67,7 @@ DRIVEN = ("uncompressed", "null")  # contenders that are also matched as a whole
 
 Seconds = dict[str, float]  # that each stage took
 OtherModels = Mapping[str, tuple[str, DejaVu]]  # their names and models, by their keys in report.json
+Contenders = Mapping[str, tuple[str, int, Scorer]]  # their names, bytes and scores, likewise
 
 
 class Comparison(NamedTuple):
@@ -99,6 +100,7 @@ def compare(
     interpolate: bool = False,
     second: LabelledFrames | None = None,
     others: OtherModels | None = None,
+    contenders: Contenders | None = None,
     sequence: SequenceModel | Literal["auto"] | None = "auto",
     centre: bool | None = None,
     top: int = 1,
@@ -128,6 +130,8 @@ def compare(
         second: see `DejaVu.learn`; another traverse than the query.
         others: further models that learn the same reference, by their keys in report.json, with their names
             in tables. They need a ground truth, and none of them resamples.
+        contenders: further ways to store the route, by their keys in report.json: a name for tables, bytes,
+            and a `Scorer` of the same queries.
         sequence: how the answers are found, see `DejaVu.localize`; within how many places, says `reach_of`.
             With a filter or a `SequenceMatcher` the scores at top level are those of its answers, else of
             single queries.
@@ -225,15 +229,16 @@ def compare(
         pictures = draw_pictures(run, {"map": ours}) | draw_reliability(run.scored, known, tolerance)
         if on_found is not None:
             on_found(Comparison(Report(ours, {}, facts), pictures, run, candidates))
-        contenders = _other_contenders(run, others or {}, leave_out, drives == "all", seed, progress)
+        given = {key: Baseline(name, one, size) for key, (name, size, one) in (contenders or {}).items()}
+        compared = _other_contenders(run, given, others or {}, leave_out, drives == "all", seed, progress)
     coded = model.map if ours.scores is not None and isinstance(model.map, SpectralMap) else None
     storage = coded_at_sizes(run, seed=seed, progress=progress) if storage_curve and coded else None
-    pictures = pictures | draw_compared(run, {"map": ours, **contenders}, storage)
+    pictures = pictures | draw_compared(run, {"map": ours, **compared}, storage)
     facts = facts | peak_memory()
     facts |= {name: dict(picture.numbers) for name, picture in pictures.items() if picture.numbers}
     if coded is not None and len(coded.chunks) == 1:
         facts["noise_over_map"] = noise_over_map(coded, run.reference_features, seed)
-    return Comparison(Report(ours, contenders, facts), pictures, run, candidates)
+    return Comparison(Report(ours, compared, facts), pictures, run, candidates)
 
 
 def _reach(
@@ -426,9 +431,20 @@ def _localized(run: Localization, drive: bool, top: int, progress: bool) -> tupl
         own = own._replace(also=how.also, k=ranks, radius=run.tolerance, apart=how.apart, copies=how.copies)
         return model.localize_descriptors(queries, own, progress=progress)
 
-    found = run.match_by(match)
+    found = _by_both(run, match)
     best = found.map(lambda column: column[:, 0])
     return run._replace(match=best, judged=best), found
+
+
+def _by_both(run: Localization, match: Callable[[Tensor, Matching], Match]) -> Match:
+    """The matches of the queries, with those of sequences and filters of the uncentred ones."""
+    causal, matching = run.causal_features, run.matching
+    if causal is None or not (matching.also or matching.sequence):
+        return match(run.query_features, matching)
+    found = match(causal, matching)
+    if matching.sequence is not None:
+        return found
+    return replace(match(run.query_features, matching._replace(also={})), sequences=found.sequences)
 
 
 def _smoothed(
@@ -462,27 +478,32 @@ def _smoothed(
 
 
 def _other_contenders(
-    run: Localization, others: OtherModels, leave_out: int | None, drives: bool, seed: int, progress: bool
+    run: Localization,
+    given: Mapping[str, Baseline],
+    others: OtherModels,
+    leave_out: int | None,
+    drives: bool,
+    seed: int,
+    progress: bool,
 ) -> dict[str, Contender]:
-    """The baselines, null controls and further models, scored; `drives`: all of them as whole drives too."""
+    """The baselines, null controls, given ones and further models, scored; `drives`: all of them as whole
+    drives too."""
     table, judged = run.model.map.table, run.truth is not None
     itself = table.scored(torch.arange(table.places))[:, None]  # of the places as queries
     found = baselines_of(run, seed, leave_out, progress) if judged or leave_out is not None else {}
+    found |= given if judged else {}
     for key, (name, other) in others.items() if judged else ():
         other.learn(run.reference, progress)
         queries, size = run.described_by(other, progress), other.summary()
         match = other.localize_descriptors(queries, run.matching, progress=progress)
-        beside = copy.deepcopy(run.beside)
-        asked = (
-            None if beside is None else other.localizer(SINGLE).drive_query(OfMap(other.map, queries), beside)
-        )
-        found[key] = Baseline(name, match, size.map_bytes, None, size.fixed_bytes, asked)
-    if not drives:
-        found = {key: one if key in DRIVEN else one._replace(asked=None) for key, one in found.items()}
+        sizes = size.map_bytes, None, size.fixed_bytes
+        found[key] = Baseline(name, OfMap(other.map, queries), *sizes, match, asks=True)
+    driven = found if drives else DRIVEN
     contenders = {}
-    for key, (name, match, bytes, k, fixed, _) in with_drives(found, progress).items():
-        truth, match = itself if key == "leave_out" else run.truth, match.renumbered(table.scored)
-        contenders[key] = contend(name, match, truth, run.tolerance, bytes, k, fixed)
+    for key, match in matches_of(found, run.matching, run.beside, driven, progress).items():
+        truth, one = itself if key == "leave_out" else run.truth, found[key]
+        known = match.renumbered(table.scored), truth, run.tolerance
+        contenders[key] = contend(one.name, *known, one.bytes, one.k, one.fixed)
     return contenders
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import logging
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -17,6 +18,7 @@ from dejavu_torch.maps.templates import PhaseTemplates
 from dejavu_torch.memory import concatenate
 from dejavu_torch.model import DejaVu
 from dejavu_torch.recognition.localizer import Matching
+from dejavu_torch.recognition.scorer import Reordered
 from dejavu_torch.recognition.select import best_match
 from dejavu_torch.types import FrequencyLayer, InputError, Match, SequenceModel
 
@@ -52,7 +54,7 @@ def null_control(
         Match of (Q,) whose index is the reference frame *stored* at the reported place, or -1.
     """
     null, order = null_map(model, reference, seed, same_plan)
-    return null.localize_descriptors(query, sequence, order, progress)
+    return null.localize_descriptors(query, sequence, partial(Reordered, order=order), progress)
 
 
 def null_map(

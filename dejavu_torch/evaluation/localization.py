@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from typing import NamedTuple
 
 import torch
@@ -16,9 +15,8 @@ from dejavu_torch.model import DejaVu
 from dejavu_torch.motion.resampling import ResampledTraverse
 from dejavu_torch.places.positions import unit_of
 from dejavu_torch.recognition.centring import set_apart
-from dejavu_torch.recognition.drive import DriveQuery
 from dejavu_torch.recognition.filter import PlaceFilter
-from dejavu_torch.recognition.localizer import SINGLE, Matching, drive_query, wrapped
+from dejavu_torch.recognition.localizer import SINGLE, Matching, wrapped
 from dejavu_torch.recognition.scorer import OfMap, Scorer
 from dejavu_torch.recognition.smoother import PlaceSmoother
 from dejavu_torch.types import Match, SequenceModel, Traverse
@@ -73,19 +71,10 @@ class Localization(NamedTuple):
         rows = model.descriptor.all_of(self.asked, progress)
         return set_apart(model.map, rows) if isinstance(self.asked, Turned) else rows
 
-    def match_by(self, match: Callable[[Tensor, Matching], Match]) -> Match:
-        """The matches of a function of queries and matching, with those of all models in `sequences`."""
-        causal, matching = self.causal_features, self.matching
-        if causal is None or not (matching.also or matching.sequence):
-            return match(self.query_features, matching)
-        found = match(causal, matching)
-        if matching.sequence is not None:
-            return found
-        return replace(match(self.query_features, matching._replace(also={})), sequences=found.sequences)
-
-    def as_drive(self, scorer: Scorer) -> DriveQuery | None:
-        """Queries as a drive with other scores, if a smoother is compared."""
-        return None if self.beside is None else drive_query(scorer, self.beside)
+    def scorer_by(self, make: Callable[[Tensor], Scorer]) -> Scorer:
+        """Other scores of the queries, which also know them uncentred."""
+        scorer, causal = make(self.query_features), self.causal_features
+        return scorer if causal is None else scorer.beside(make(causal))
 
     @property
     def coarsest(self) -> int:

@@ -18,6 +18,7 @@ from dejavu_torch.maps.spectral import SpectralMapper
 from dejavu_torch.maps.spectral_map import SpectralMap
 from dejavu_torch.maps.spectrum import from_spectrum, spectrum
 from dejavu_torch.recognition.localizer import SINGLE
+from dejavu_torch.recognition.scorer import Reordered
 from dejavu_torch.text import with_progress
 from dejavu_torch.types import InputError, Match
 
@@ -101,7 +102,8 @@ def _coded(
         model.learn_features(features, layout=place_map.layout)
     except InputError:  # more than floats, or less than the mean
         return
-    found = model.localize_descriptors(run.query_features, run.matching, order)
+    wrapped = None if order is None else partial(Reordered, order=order)
+    found = model.localize_descriptors(run.query_features, run.matching, wrapped)
     yield found, sum(tensor.nbytes for tensor in model.map.packed().values())
 
 

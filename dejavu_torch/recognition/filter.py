@@ -133,7 +133,7 @@ class PlaceFilter(SequenceModel):
             return copied
         if torch.equal(self.move_logits.cpu().float(), logits(*before)):
             copied.move_logits = nn.Parameter(logits(*after).to(self.off_map))
-        if float(self.log_sharpness.exp()) == SHARPNESS[self.layout.dimensions]:
+        if float(self.log_sharpness.detach().exp()) == SHARPNESS[self.layout.dimensions]:
             copied.log_sharpness.data.fill_(math.log(SHARPNESS[layout.dimensions]))
         return copied
 

@@ -21,7 +21,7 @@ from dejavu_torch.recognition.calibration import confidence as confidence_of_pai
 from dejavu_torch.recognition.drive import DriveQuery, first_of, localize_drive
 from dejavu_torch.recognition.filter import PlaceFilter
 from dejavu_torch.recognition.samples import GROUP, RowSearch
-from dejavu_torch.recognition.scorer import BestOf, Earlier, Scorer, earlier, of_stored
+from dejavu_torch.recognition.scorer import BestOf, Earlier, Scorer, of_stored
 from dejavu_torch.recognition.search import SCORES_AT_ONCE, NmsSpec, Scan, Search, Searcher, num_needed
 from dejavu_torch.recognition.select import Acceptance, accept, best_candidates, best_match
 from dejavu_torch.recognition.sequence import SequenceMatcher
@@ -119,7 +119,6 @@ class Localizer:
         if isinstance(sequence, SequenceModel):
             self.models[self.own] = sequence
         self.states: dict[Together, Tensor] = {}  # of the models; empty before the first query
-        self.matched = 0  # queries so far
         self.route_starts = layout.starts
 
     def __call__(self, descriptors: Tensor, progress: bool = False) -> Match:
@@ -145,7 +144,7 @@ class Localizer:
         wanted = [(matching.k or 1, matching.radius), (min(2, places), TOLERANCE)]
         n = num_needed(wanted, self.layout)
         few = n <= max(1, MAX_SHARE * min(places, place_map.block_places)) or places > SCORES_AT_ONCE
-        searches = not self.models and matching.callback is None and matching.apart is None
+        searches = not self.models and matching.callback is None
         searches = searches and (type(self.searcher) is not Scan or (few and places > SHORT))
         per_number = GROUP if isinstance(self.searcher, RowSearch) else PLACES_PER_NUMBER
         size = max(PER_BEST * n, places // per_number) if searches else places
@@ -193,10 +192,6 @@ class Localizer:
         turn, copies = None, self.matching.copies
         if copies > 1:
             scores, turn = scores.view(-1, copies, scores.shape[1]).min(1)
-        if self.matching.apart is not None:
-            numbers = self.matched + torch.arange(len(scores))
-            scores = earlier(scores, numbers, self.matching.apart)
-            self.matched += len(scores)
         parts = scores.split(max(1, CACHED // scores.shape[1]))
         turns = [None] * len(parts) if turn is None else turn.split(len(parts[0]))
         if not self.models:
@@ -343,33 +338,39 @@ def wrapped(scorer: Scorer, matching: Matching) -> Scorer:
     return scorer if matching.apart is None else Earlier(scorer, matching.apart)
 
 
-def drive_query(scorer: Scorer, smoother: PlaceSmoother) -> DriveQuery:
+def drive_query(scorer: Scorer, smoother: PlaceSmoother, asks: bool = False) -> DriveQuery:
     """Queries as a drive with scores of any kind, for a smoother like this one."""
     smoother = copy.deepcopy(smoother)
     smoother.map_links = scorer.links
-    return DriveQuery(scorer, smoother, radius=0, asks=False)
+    return DriveQuery(scorer, smoother, radius=0, asks=asks)
 
 
 @torch.no_grad()
 def match_scores(
     scorer: Scorer, matching: Matching = SINGLE, progress: bool = False, verb: str = "localizing"
 ) -> Match:
-    """The matches of queries by their scores alone. Single ones find places that are `stored`, sequences also
-    those between."""
+    """The matches of queries by their scores alone, sequences and filters by the uncentred ones. Single ones
+    find places that are `stored`, sequences also those between."""
+    if scorer.uncentred is not None and (matching.also or matching.sequence):
+        found = match_scores(scorer.uncentred, matching, progress, verb)
+        if matching.sequence is not None:
+            return found
+        alone = match_scores(scorer, matching._replace(also={}), progress, verb)
+        return replace(alone, sequences=found.sequences)
     scorer, how = wrapped(scorer, matching), matching._replace(copies=1, apart=None)
     matcher = Localizer(None, how, layout=scorer.layout)
-    alone = Localizer(None, how._replace(sequence=None, also={}), layout=scorer.layout)
-    single, found = matching.sequence is None or matcher.own == 1, []
+    singly = Localizer(None, how._replace(sequence=None, also={}), layout=scorer.layout)
+    single, parts = matching.sequence is None or matcher.own == 1, list[Match]()
     for part in with_progress(scorer.parts(), verb, progress):
         scores = scorer.rows(part)
         match = matcher.match(scores)
         if scorer.stored is not None and (single or 1 in match.sequences):
             # else another place would be the same stored frame
-            one = alone.match(of_stored(scores, scorer.stored))
+            one = singly.match(of_stored(scores, scorer.stored))
             sequences = {T: one if T == 1 else several for T, several in match.sequences.items()}
             match = replace(one if single else match, sequences=sequences)
-        found.append(match)
-    return Match.joined(found)
+        parts.append(match)
+    return Match.joined(parts)
 
 
 def whole(rows: int, copies: int) -> int:

@@ -11,6 +11,7 @@ from collections.abc import Callable
 
 import torch
 from torch import Tensor
+from typing_extensions import Self
 
 from dejavu_torch.maps.distance import Metric, phase_distances
 from dejavu_torch.maps.place_map import PlaceMap, ScoreBlocks
@@ -34,7 +35,8 @@ class Scorer(ABC):
         null: as `rows`, of `flipped` queries, for a seed; without it their order alone tells whether they are
             a drive, by at least `least` nats for each query.
         at_once: numbers that are computed together. stored: the places that are stored themselves, (n,), if
-            others have the scores of these.
+            others have the scores of these. uncentred: of the same queries as they are, for ways that do not
+            know all of them; None if these are.
     """
 
     layout: Layout
@@ -44,6 +46,7 @@ class Scorer(ABC):
     least: float = 0.0
     at_once: int = SCORES_AT_ONCE
     stored: Tensor | None = None
+    uncentred: Scorer | None = None
 
     def __len__(self) -> int:
         return len(self.descriptors)
@@ -64,6 +67,11 @@ class Scorer(ABC):
     def copy_at(self, queries: Tensor, places: Tensor) -> Tensor:
         """Which copy of each query answers at places, (B,), (B,k) -> (B,k)."""
         return torch.zeros_like(places)
+
+    def beside(self, uncentred: Scorer) -> Self:
+        """Let it know the scores of its queries as they are; returns itself."""
+        self.uncentred = uncentred
+        return self
 
     def parts(self) -> list[Tensor]:
         """The numbers of all queries, as many as are scored together."""

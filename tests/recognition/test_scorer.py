@@ -1,0 +1,92 @@
+"""Scores of queries by their numbers, in blocks, and wrapped."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dejavu_torch import DejaVu, Layout, SpectralMapper
+from dejavu_torch.maps.distance import phase_distances
+from dejavu_torch.recognition.localizer import Matching, match_scores
+from dejavu_torch.recognition.scorer import BestOf, Earlier, OfMap, OfRows, OfStored, Reordered
+
+
+def noise(*shape, seed=0):
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed))
+
+
+@pytest.fixture(scope="module")
+def place_map():
+    return SpectralMapper(step=0.1, chunk=32)(noise(90, 6, seed=1))
+
+
+def test_rows_are_blocks_and_scores_of_the_map(place_map):
+    queries = noise(12, 6)
+    scorer, some = OfMap(place_map, queries), torch.tensor([3, 0, 11])
+    rows = scorer.rows(some)
+    torch.testing.assert_close(rows, place_map.scores(queries[some]))
+    blocks = [*scorer.blocks(some)]
+    assert len(blocks) > 1
+    torch.testing.assert_close(torch.cat([scores for _, scores in blocks], 1), rows)
+    assert scorer.width == place_map.block_places
+    assert (len(scorer), scorer.layout) == (12, place_map.layout)
+    assert torch.cat(scorer.parts()).tolist() == [*range(12)]
+    mirrored = scorer.null(some, seed=1)
+    assert mirrored.shape == rows.shape
+    assert not torch.allclose(mirrored, scorer.null(some, seed=2))
+
+
+@given(k=st.integers(1, 5), rows=st.integers(1, 6), columns=st.integers(1, 6), seed=st.integers(0, 9))
+def test_stored_frames_answer_for_their_neighbours_in_each_direction(k, rows, columns, seed):
+    layout, frames, queries = Layout(rows, columns), noise(rows * columns, 4, seed=seed), noise(5, 4)
+    scorer, every = OfStored(frames, queries, k, layout=layout), torch.arange(5)
+    stored, nearest = layout.strided(k)
+    expected = phase_distances(queries, frames, "l1")[:, stored[nearest]]
+    torch.testing.assert_close(scorer.rows(every), expected)
+    found = match_scores(scorer).index
+    assert torch.isin(found, stored).all()
+    assert torch.equal(found, stored[phase_distances(queries, frames[stored], "l1").argmin(1)])
+
+
+@given(copies=st.integers(1, 4), seed=st.integers(0, 20))
+def test_wrappers_commute_where_they_have_nothing_to_do_with_each_other(copies, seed):
+    every, order = torch.arange(6), torch.randperm(9, generator=torch.Generator().manual_seed(seed))
+    scores = noise(6 * copies, 9, seed=seed)
+    inner = OfRows(
+        scores.__getitem__, noise(6 * copies, 3), Layout(9), lambda numbers, seed: scores[numbers] + seed
+    )
+    one, other = BestOf(Reordered(inner, order), copies), Reordered(BestOf(inner, copies), order)
+    assert len(one) == len(other) == 6
+    assert torch.equal(one.rows(every), other.rows(every))
+    best = scores.view(6, copies, 9).amin(1)
+    assert torch.equal(one.rows(every)[:, torch.arange(9)], best[:, order.argsort()])
+    assert torch.equal(one.null(every, seed=2), one.rows(every) + 2)
+    places = one.rows(every).topk(2, 1, largest=False).indices
+    turn = BestOf(inner, copies).copy_at(every, order.argsort()[places])
+    at = scores.view(6, copies, 9).gather(2, order.argsort()[places][:, None].expand(-1, copies, -1))
+    assert torch.equal(turn, at.argmin(1))
+    assert torch.equal(one.copy_at(every, places), turn)
+    assert torch.equal(one.descriptors, inner.descriptors[::copies])
+
+
+def test_only_earlier_places_answer_and_blank_queries_find_none():
+    scores, descriptors = noise(9, 9), noise(9, 3)
+    descriptors[7] = 0
+    scorer = Earlier(OfRows(scores.__getitem__, descriptors, Layout(9)), 3)
+    rows = scorer.rows(torch.arange(9))
+    for query, row in enumerate(rows):
+        assert row.isfinite().nonzero()[:, 0].tolist() == ([] if query == 7 else [*range(max(0, query - 3))])
+    assert scorer.null is None
+
+
+def test_a_wrapper_changes_what_a_model_finds():
+    route = noise(80, 8, seed=3)
+    model, queries = DejaVu(whitening="none").learn(route), route + 0.1 * noise(80, 8, seed=4)
+    order = torch.randperm(80, generator=torch.Generator().manual_seed(1))
+    shuffled = DejaVu(whitening="none").learn(route[order])
+    found = shuffled.localize_descriptors(queries, None, lambda scorer: Reordered(scorer, order))
+    assert float((found.index == torch.arange(80)).double().mean()) > 0.9
+    several = model.localize_descriptors(queries, Matching(k=3, radius=5), lambda scorer: scorer)
+    assert torch.equal(several.index, model.localize_descriptors(queries, Matching(k=3, radius=5)).index)
