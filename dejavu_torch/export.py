@@ -26,7 +26,6 @@ from dejavu_torch.model import DejaVu, require_map
 from dejavu_torch.recognition.calibration import POWER
 from dejavu_torch.recognition.calibration import TOLERANCE as BEYOND
 from dejavu_torch.recognition.centring import running_mean
-from dejavu_torch.recognition.filter import PlaceFilter
 from dejavu_torch.recognition.sequence import SequenceMatcher
 from dejavu_torch.text import one_line
 from dejavu_torch.types import Facts, InputError, SequenceModel, expect
@@ -175,7 +174,7 @@ def export_onnx(
         sequence.check(None, model.map.places)
         seen = f"the map of an area, and {type(sequence).__name__}"
         model.map.layout.expect_route("single queries to export", seen)
-    if isinstance(sequence, PlaceFilter) and sequence.lag:
+    if sequence is not None and sequence.lag:
         seen = f"a filter with a lag of {sequence.lag}"
         raise InputError(f"{seen}; expected one without: an ONNX file answers each frame at once")
     size = 4 * model.map.places * model.map.dimension if isinstance(model.map, SpectralMap) else 0

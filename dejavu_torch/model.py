@@ -34,7 +34,6 @@ from dejavu_torch.motion.resampling import ResampledTraverse, resampled, source_
 from dejavu_torch.places.layout import ROUTE, Layout
 from dejavu_torch.recognition.centring import PRIOR, centred, set_apart
 from dejavu_torch.recognition.coarse import searcher
-from dejavu_torch.recognition.filter import PlaceFilter
 from dejavu_torch.recognition.localizer import Localizer, Matching, match_scores
 from dejavu_torch.recognition.scorer import OfMap, Scorer
 from dejavu_torch.recognition.search import Scan, Search, Searcher, check_search
@@ -436,7 +435,7 @@ class DejaVu(nn.Module):
         if wrapped is not None or matching.apart is not None:
             return match_scores(scorer, matching, progress)
         match = localizer(descriptors, progress)
-        late = isinstance(smoother, PlaceFilter) and smoother.lag
+        late = smoother is not None and smoother.lag
         return Match.joined([match, localizer.finish()]) if late else match
 
     def loops(self, traverse: Source, apart: int = 50, drive: bool = True, progress: bool = False) -> Match:
@@ -476,10 +475,7 @@ class DejaVu(nn.Module):
         require_map(self)
         check_search(matching.search)
         if matching.sequence is not None:
-            if not isinstance(matching.sequence, PlaceSmoother | PlaceFilter):
-                expected = "single images (--match single), a PlaceFilter or a PlaceSmoother"
-                seen = f"{type(matching.sequence).__name__}, and the map of an area"
-                self.map.layout.expect_route(expected, seen)
+            matching.sequence.over(self.map.layout)
             matching.sequence.check(None, self.map.places)
         single = matching.sequence is None and matching.callback is None
         if not single or matching.search not in ("auto", "coarse"):
@@ -522,7 +518,8 @@ class DejaVu(nn.Module):
             self.descriptor.warn_of_bright(frames, name)
 
         turned = isinstance(queries, Turned)
-        if not (isinstance(sequence, PlaceSmoother) or (centre and not turned) or headings > 1):
+        whole = sequence is not None and sequence.whole
+        if not (whole or (centre and not turned) or headings > 1):
             batches = self.descriptor.batches(queries, progress, "localizing", on_first)
             yield from map(localizer, (set_apart(self.map, rows) if turned else rows for rows in batches))
             return
@@ -569,7 +566,7 @@ class DejaVu(nn.Module):
     def matching(self, sequence: SequenceModel | None = None, search: Search | None = None) -> Matching:
         """How queries are matched, with probabilities if the map is calibrated for it. Raises InputError if a
         precision lacks this calibration."""
-        smooths = isinstance(sequence, PlaceSmoother)  # its probabilities are its own
+        smooths = sequence is not None and sequence.whole  # its probabilities are its own
         platt = self.calibration and self.calibration.of(None if smooths else sequence)
         if self.precision is not None and platt is None and not smooths:
             only = "calibrated for single queries and for a filter only"
@@ -595,7 +592,7 @@ class DejaVu(nn.Module):
         if threshold is not None or self.precision is not None:
             return Acceptance(threshold, None if threshold is not None else self.precision)
         known = self.calibration is not None and self.calibration.of(sequence) is not None
-        if known or isinstance(sequence, PlaceSmoother):
+        if known or (sequence is not None and sequence.whole):
             return Acceptance(precision=PROBABLE, given=False)
         return Acceptance(None if sequence is None else sequence.likely, given=False)
 

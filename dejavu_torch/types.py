@@ -337,11 +337,24 @@ class Training(NamedTuple):
 class SequenceModel(nn.Module, ABC):
     """Combines the scores of consecutive queries: the `sequence` argument of `DejaVu.localize`.
 
-    Convention: each score is for the place of its own query. All but a `PlaceSmoother` are causal, and their
-        memory does not grow with the queries.
+    Attributes:
+        likely: a score below it is more likely right than wrong; None if scores do not say.
+        answers: what reports call its answers: "sequence", "filter" or "drive". A map is calibrated for
+            single queries and for a filter.
+        whole: whether it needs all queries, as of a drive.
+        length, speeds: queries that it sums over, and places that pass from one to the next, if it has these.
+        lag: queries by which its answers come later.
+
+    Convention: each score is for the place of its own query. All but those of a `whole` drive are causal, and
+        their memory does not grow with the queries.
     """
 
-    likely: float | None = None  # a score below it is more likely right than wrong; None if scores do not say
+    likely: float | None = None
+    answers: Literal["sequence", "filter", "drive"] = "sequence"
+    whole: bool = False
+    length: int = 1
+    speeds: tuple[float, ...] = ()
+    lag: int = 0
 
     @abstractmethod
     def start(self, places: int, fixed: bool = False) -> Tensor:
@@ -357,6 +370,35 @@ class SequenceModel(nn.Module, ABC):
     @abstractmethod
     def check(self, queries: int | None, places: int) -> None:
         """Refuse, or warn of, a number of places or (if known) of queries for which it makes no sense."""
+
+    @property
+    def key(self) -> Together:
+        """By which its matches are among `Match.sequences`."""
+        return "filter"
+
+    def over(self, layout: Layout) -> Self:
+        """The same for places that lie so; InputError if it makes no sense there."""
+        expected = "single images (--match single), a PlaceFilter or a PlaceSmoother"
+        layout.expect_route(expected, f"{type(self).__name__}, and the map of an area")
+        return self
+
+    def reaching(self, within: int) -> Self:
+        """A copy that sums up probabilities within so many places, if it has such a number, `within`."""
+        copied = copy.deepcopy(self)
+        copied.__dict__.update({"within": within} if "within" in self.__dict__ else {})
+        return copied
+
+    def finish(self, state: Tensor, route_starts: Sequence[int] = (0,)) -> tuple[Tensor, Tensor]:
+        """The answers that wait for later queries, at the end of all: -> scores (B,N), the next state."""
+        return state.new_zeros(0, state.shape[-1]), state
+
+    def waiting(self, state: Tensor) -> Tensor:
+        """Scores (R,N) of the queries that wait for their answers."""
+        return state[:0]
+
+    def skipped(self, state: Tensor, queries: int, route_starts: Sequence[int] = (0,)) -> Tensor:
+        """The state after queries that are left out."""
+        return state
 
     def threshold_of(self, threshold: float | None) -> float | None:
         """The acceptance threshold for its scores, given the one for single queries."""

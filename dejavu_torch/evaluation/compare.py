@@ -49,7 +49,6 @@ from dejavu_torch.motion.resampling import ground_truth_of, resampled, source_of
 from dejavu_torch.places.layout import Layout, Reach
 from dejavu_torch.recognition.calibration import TOLERANCE
 from dejavu_torch.recognition.centring import centred, set_apart
-from dejavu_torch.recognition.filter import PlaceFilter
 from dejavu_torch.recognition.localizer import Matching
 from dejavu_torch.recognition.scorer import OfMap, Scorer
 from dejavu_torch.recognition.select import check_candidates
@@ -195,10 +194,9 @@ def compare(
             known = ground_truth_in_places(known, model.map.place_of)
             known = of_loops(known, torch.arange(len(query)), loops) if loops is not None else known
         reach = reach_of(within, known, near is not None or radius > 0)
-        smoother, causal = copy.deepcopy((smoother, causal))  # the caller keeps his reach
-        for one in (smoother, causal):
-            if isinstance(one, PlaceSmoother | PlaceFilter):
-                one.within = reach
+        # the caller keeps his own
+        smoother = None if smoother is None else smoother.reaching(reach)
+        causal = None if causal is None else causal.reaching(reach)
         with _calibrated(model, reach, reference, calibration, progress):
             with timed(seconds, "localize"):
                 # without truth they have no scores

@@ -20,8 +20,6 @@ from dejavu_torch.maps.distance import l1_backend
 from dejavu_torch.maps.summary import MapSummary
 from dejavu_torch.motion.resampling import ResampledTraverse, source_of
 from dejavu_torch.periods.spectrogram import BACKEND
-from dejavu_torch.recognition.filter import PlaceFilter
-from dejavu_torch.recognition.sequence import SequenceMatcher
 from dejavu_torch.text import plain_number
 from dejavu_torch.types import Facts, Match
 
@@ -58,7 +56,7 @@ def _map_facts(summary: MapSummary, features: Tensor) -> Facts:
 def _run_facts(run: Localization, seconds: Mapping[str, float]) -> Facts:
     """The entries of report.json about the run; no seconds to learn if the map is given."""
     model, reference, query = run.model, run.reference, run.query
-    acceptance = model.acceptance(run.smoother or run.sequence)
+    acceptance, way = model.acceptance(run.smoother or run.sequence), run.sequence
     facts = {
         "answers": run.answers,
         "seconds_learn": seconds["learn"],
@@ -67,9 +65,9 @@ def _run_facts(run: Localization, seconds: Mapping[str, float]) -> Facts:
         "spectrogram_backend": BACKEND,
         "threshold": acceptance.threshold,
         "least_probability": acceptance.precision,
-        "sequence": run.sequence.length if isinstance(run.sequence, SequenceMatcher) else 1,
-        "speeds": list(run.sequence.speeds) if isinstance(run.sequence, SequenceMatcher) else None,
-        "filter": isinstance(run.sequence, PlaceFilter),
+        "sequence": 1 if way is None else way.length,
+        "speeds": None if way is None or not way.speeds else [*way.speeds],
+        "filter": way is not None and way.answers == "filter",
         "trained": model.trained and model.trained._asdict(),
         **({} if run.has_frames else {"ready": True}),
         "reference": reference.name,

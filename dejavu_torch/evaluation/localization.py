@@ -15,7 +15,6 @@ from dejavu_torch.model import DejaVu
 from dejavu_torch.motion.resampling import ResampledTraverse
 from dejavu_torch.places.positions import unit_of
 from dejavu_torch.recognition.centring import set_apart
-from dejavu_torch.recognition.filter import PlaceFilter
 from dejavu_torch.recognition.localizer import SINGLE, Matching, wrapped
 from dejavu_torch.recognition.scorer import OfMap, Scorer
 from dejavu_torch.recognition.smoother import PlaceSmoother
@@ -88,8 +87,7 @@ class Localization(NamedTuple):
             return "loops"
         if self.smoother is not None:
             return "drive" if self.smoother.is_drive else "single"
-        together = isinstance(self.sequence, PlaceFilter)
-        return "filter" if together else "single" if self.sequence is None else "sequence"
+        return "single" if self.sequence is None else self.sequence.answers
 
     @property
     def scored(self) -> Match:

@@ -143,9 +143,13 @@ class LiveLocalizer:
         return self._told(self._localizer.finish(), start)
 
     @property
+    def _filters(self) -> bool:
+        return self.sequence is not None and self.sequence.answers == "filter"
+
+    @property
     def lag(self) -> int:
         """Frames by which an answer comes later."""
-        return self.sequence.lag if isinstance(self.sequence, PlaceFilter) else 0
+        return 0 if self.sequence is None else self.sequence.lag
 
     def _told(self, matches: Match, start: float) -> list[LiveMatch]:
         milliseconds = 1e3 * (time.perf_counter() - start) / max(1, len(matches))
@@ -161,7 +165,7 @@ class LiveLocalizer:
             frame=int(table.own_frame_of(match.index)),
             name=model.frame_names[shown] if model.frame_names and shown >= 0 else "",
             score=score,
-            posterior=math.exp(-score) if isinstance(self.sequence, PlaceFilter) else math.nan,
+            posterior=math.exp(-score) if self._filters else math.nan,
             probability=math.nan if match.probability is None else float(match.probability),
             accepted=bool(match.accepted),
             milliseconds=milliseconds,

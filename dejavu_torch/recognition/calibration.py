@@ -60,7 +60,7 @@ class Calibration(NamedTuple):
         """The scaling for a way of matching; None if that is not calibrated."""
         if sequence is None:
             return self.single
-        return self.filter if isinstance(sequence, PlaceFilter) else None
+        return self.filter if sequence.answers == "filter" else None
 
 
 def strictest(known: Sequence[Calibration | None]) -> Calibration | None:

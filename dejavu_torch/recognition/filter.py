@@ -10,6 +10,7 @@ from typing import NamedTuple
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
+from typing_extensions import Self
 
 from dejavu_torch.memory import is_plain, without_autocast
 from dejavu_torch.places.layout import ROUTE, Layout
@@ -94,6 +95,7 @@ class PlaceFilter(SequenceModel):
     """
 
     likely = math.log(2)
+    answers = "filter"
 
     def __init__(
         self,
@@ -123,7 +125,7 @@ class PlaceFilter(SequenceModel):
         self.within, self.threshold, self.lag, self.learns = within, threshold, lag, learns
         self.layout = ROUTE  # of the places, which a `Localizer` sets
 
-    def over(self, layout: Layout) -> PlaceFilter:
+    def over(self, layout: Layout) -> Self:
         """A copy for places that lie so; moves and sharpness for an area replace those for a route by
         default."""
         copied = copy.deepcopy(self)

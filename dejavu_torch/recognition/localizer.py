@@ -19,12 +19,10 @@ from dejavu_torch.places.layout import ROUTE, Layout
 from dejavu_torch.recognition.calibration import TOLERANCE, Platt, Track, best_pair, confidence_of
 from dejavu_torch.recognition.calibration import confidence as confidence_of_pair
 from dejavu_torch.recognition.drive import DriveQuery, first_of, localize_drive
-from dejavu_torch.recognition.filter import PlaceFilter
 from dejavu_torch.recognition.samples import GROUP, RowSearch
 from dejavu_torch.recognition.scorer import BestOf, Earlier, Scorer, of_stored
 from dejavu_torch.recognition.search import SCORES_AT_ONCE, NmsSpec, Scan, Search, Searcher, num_needed
 from dejavu_torch.recognition.select import Acceptance, accept, best_candidates, best_match
-from dejavu_torch.recognition.sequence import SequenceMatcher
 from dejavu_torch.recognition.smoother import PlaceSmoother
 from dejavu_torch.recognition.taken import (
     AT_FIRST,
@@ -96,27 +94,24 @@ class Localizer:
         layout: Layout = ROUTE,
     ) -> None:
         self.layout = layout = layout if place_map is None else place_map.layout  # of the places
-        in_area = {
-            T: one.over(layout) if isinstance(one, PlaceFilter) else one for T, one in matching.also.items()
-        }
-        sequence = matching.sequence
-        if isinstance(sequence, PlaceFilter):
-            sequence = sequence.over(layout)
-        matching = matching._replace(sequence=sequence, also=in_area)
+        also = {T: one.over(layout) for T, one in matching.also.items()}
+        sequence = None if matching.sequence is None else matching.sequence.over(layout)
+        matching = matching._replace(sequence=sequence, also=also)
         self.place_map, self.matching, self.track = place_map, matching, Track(layout)
         # what single images say so far, beside mirrored ones, if these are asked
         self.running = Running(SURER[layout.dimensions])
         self.lock = threading.RLock()
         self.total: Tensor | None = None  # of the queries so far
-        asks = isinstance(sequence, PlaceFilter) and matching.platt is not None and matching.copies == 1
+        filters = sequence is not None and sequence.answers == "filter"
+        asks = filters and matching.platt is not None and matching.copies == 1
         if asks and place_map is not None and (place_map.fidelity or 0) >= FAITHFUL:
             self.total = torch.zeros(place_map.dimension)
         # probabilities, each by itself, of queries that a filter has yet to answer
         self.alone = torch.empty(0, dtype=torch.float64)
         self.searcher = Scan(place_map) if searcher is None and place_map is not None else searcher
-        self.own: Together = sequence.length if isinstance(sequence, SequenceMatcher) else "filter"
+        self.own: Together = "filter" if sequence is None else sequence.key
         self.models: dict[Together, SequenceModel] = {**matching.also}
-        if isinstance(sequence, SequenceModel):
+        if sequence is not None:
             self.models[self.own] = sequence
         self.states: dict[Together, Tensor] = {}  # of the models; empty before the first query
         self.route_starts = layout.starts
@@ -234,18 +229,18 @@ class Localizer:
     @torch.no_grad()
     def skip(self, queries: int) -> None:
         """Skip queries: a `PlaceFilter` moves once more for each."""
-        filter = self.matching.sequence
-        if queries and isinstance(filter, PlaceFilter) and self.states:
-            state = filter.skipped(self.states["filter"], queries, self.route_starts)
-            self.states = self.states | {"filter": state}
+        sequence = self.matching.sequence
+        if queries and sequence is not None and self.states:
+            state = sequence.skipped(self.states[self.own], queries, self.route_starts)
+            self.states = self.states | {self.own: state}
 
     @torch.no_grad()
     def finish(self) -> Match:
         """The answers that a `PlaceFilter` with a lag still owes, after the last query; else none."""
         places = 1 if self.place_map is None else self.place_map.places
-        if not isinstance(self.matching.sequence, PlaceFilter) or not self.states:
+        if self.matching.sequence is None or not self.matching.sequence.lag or not self.states:
             return self.match(torch.zeros(0, places))
-        match = self._in_sequence(self.states["filter"].new_zeros(0, places), last=True)
+        match = self._in_sequence(self.states[self.own].new_zeros(0, places), last=True)
         return self._doubted(match, torch.tensor(self.running.odds)) if len(self.alone) else match
 
     def _doubted(self, match: Match, odds: Tensor) -> Match:
@@ -271,11 +266,11 @@ class Localizer:
     def _in_sequence(self, scores: Tensor, turn: Tensor | None = None, last: bool = False) -> Match:
         states = self.states or {T: m.start(scores.shape[1]).to(scores) for T, m in self.models.items()}
         steps = {T: m.step(scores, states[T], self.route_starts) for T, m in self.models.items()}
-        filter, single = self.matching.sequence, self.matching.sequence is None
-        if isinstance(filter, PlaceFilter) and filter.lag:
+        sequence, single = self.matching.sequence, self.matching.sequence is None
+        if sequence is not None and sequence.lag:
             if last:
-                steps[self.own] = filter.finish(states[self.own], self.route_starts)
-            answered = torch.cat([filter.waiting(states[self.own]), scores])
+                steps[self.own] = sequence.finish(states[self.own], self.route_starts)
+            answered = torch.cat([sequence.waiting(states[self.own]), scores])
             scores, turn = answered[: len(steps[self.own][0])], None  # not those of the queries answered
         final = scores if single else steps[self.own][0]
         pair, confidence = best_pair(final, self.layout), None

@@ -12,7 +12,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from dejavu_torch.memory import is_readable
-from dejavu_torch.types import InputError, SequenceModel, expect
+from dejavu_torch.types import InputError, SequenceModel, Together, expect
 
 MAX_LENGTH = 2**16  # queries of a sequence
 
@@ -57,6 +57,10 @@ class SequenceMatcher(SequenceModel):
         self.speeds = tuple(float(speed) for speed in speeds) if isinstance(speeds, Iterable) else ()
         fits = self.speeds and all(map(math.isfinite, self.speeds))
         expect(fits, "at least one finite number of places per query", f"the speeds are {speeds}")
+
+    @property
+    def key(self) -> Together:
+        return self.length
 
     def _shifts(self, speed: float) -> list[int]:
         """Places from a trajectory's end back to it, 0, 1, .., T - 1 queries before the latest."""

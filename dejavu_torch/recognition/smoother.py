@@ -11,6 +11,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 from typing_extensions import Self
 
+from dejavu_torch.places.layout import Layout
 from dejavu_torch.places.rectangles import window_sums
 from dejavu_torch.places.states import Link, States
 from dejavu_torch.recognition.evidence import (
@@ -151,6 +152,8 @@ class PlaceSmoother(SequenceModel):
     values: Tensor
     means: Tensor
 
+    answers, whole = "drive", True
+
     def __init__(
         self,
         moves: Sequence[float] = MOVES,
@@ -192,6 +195,9 @@ class PlaceSmoother(SequenceModel):
         self.prior, self.rate_prior, self.first_separation = moves, (jump, leave, enter), float(separation)
         self.register_buffer("values", torch.zeros(0), persistent=False)  # of the rank table
         self.register_buffer("means", torch.zeros(0), persistent=False)  # scores of each place
+
+    def over(self, layout: Layout) -> Self:
+        return self
 
     def start(self, places: int, fixed: bool = False) -> Tensor:
         raise InputError(WHOLE)
