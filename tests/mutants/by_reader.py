@@ -275,9 +275,9 @@ MUTANTS = [
     ),
     Mutant(
         "A match on a map of shuffled frames (the null) tells the frame that is stored at the place.",
-        "dejavu_torch/model.py",
-        "place = order.argsort().to(device)",
-        "place = order.to(device)",
+        "dejavu_torch/recognition/scorer.py",
+        "self.place = order.argsort()",
+        "self.place = order",
         (
             "tests/evaluation/test_controls.py::test_convention_8_a_match_of_the_null_names_the_frame_that_is_stored",
         ),

@@ -244,8 +244,8 @@ MUTANTS = [
     Mutant(
         "Without --drives all only float and control are matched as whole drives.",
         "dejavu_torch/evaluation/compare.py",
-        "if not drives:",
-        "if drives:",
+        "driven = found if drives else DRIVEN",
+        "driven = found",
         ("tests/evaluation/test_compare.py::-k stands_beside_single",),
     ),
     Mutant(
@@ -690,7 +690,7 @@ MUTANTS = [
     ),
     Mutant(
         "A frame finds no loop to itself, or to the frames just before it.",
-        "dejavu_torch/recognition/localizer.py",
+        "dejavu_torch/recognition/scorer.py",
         "place >= (numbers[:, None] - apart)",
         "place > (numbers[:, None] - apart)",
         ("tests/test_loops.py::-k second_lap",),
@@ -698,8 +698,8 @@ MUTANTS = [
     Mutant(
         "Where lengths count, half of each place's mean score stays.",
         "dejavu_torch/recognition/localizer.py",
-        "smoother.removed = matching.removed",
-        "smoother.removed = 1.0",
+        "smoother.map_links, smoother.removed = scorer.links, matching.removed",
+        "smoother.map_links = scorer.links",
         ("tests/features/test_whitening.py::-k told_by_the_file",),
     ),
     Mutant(
@@ -732,9 +732,9 @@ MUTANTS = [
     ),
     Mutant(
         "A coarse map is asked by motion alone.",
-        "dejavu_torch/recognition/localizer.py",
-        "own._replace(null=null) if place_map.fidelity >= FAITHFUL else own._replace(least=ALONE)",
-        "own._replace(null=null)",
+        "dejavu_torch/recognition/scorer.py",
+        "(self._mirrored, 0.0) if kept >= FAITHFUL else (None, ALONE)",
+        "(self._mirrored, 0.0)",
         ("tests/recognition/test_taken.py::-k coarse_map",),
     ),
     Mutant(
@@ -914,9 +914,9 @@ MUTANTS = [
     ),
     Mutant(
         "A whole drive follows the connections of its map.",
-        "dejavu_torch/recognition/localizer.py",
-        "() if place_map is None else place_map.connections",
-        "()",
+        "dejavu_torch/recognition/scorer.py",
+        "self.layout, self.links = place_map.layout, place_map.connections",
+        "self.layout, self.links = place_map.layout, ()",
         ("tests/test_updating.py::-k connections_are_followed",),
     ),
     Mutant(
@@ -1069,8 +1069,8 @@ MUTANTS = [
     Mutant(
         "The filter of a comparison moves in the plane.",
         "dejavu_torch/recognition/localizer.py",
-        "T: one.over(layout) if isinstance(one, PlaceFilter) else one",
-        "T: one",
+        "also = {T: one.over(layout) for T, one in matching.also.items()}",
+        "also = matching.also",
         ("tests/test_area.py::-k flight_on_the_way",),
     ),
     Mutant(
