@@ -89,6 +89,7 @@ class DejaVu(nn.Module):
         dynamic batch and `torch.compile(fullgraph=True)`.
 
     Example:
+        >>> import torch
         >>> from dejavu_torch import SpectrogramAnalysis, TemplateMapper
         >>> wave = torch.arange(64)[:, None] % torch.tensor([8.0, 9.0])  # two features that repeat
         >>> model = DejaVu(mapper=TemplateMapper(SpectrogramAnalysis(window=64, strongest=1))).learn(wave)
@@ -557,6 +558,7 @@ class DejaVu(nn.Module):
             InputError: as `localize`, or k or apart out of range.
 
         Example:
+            >>> import torch
             >>> wave = torch.arange(64)[:, None] % torch.tensor([8.0, 9.0])
             >>> DejaVu().learn(wave).candidates(wave[20:22], k=3).index[:, 0]
             tensor([20, 21])

@@ -79,7 +79,7 @@ class Localizer:
     Convention: memory does not grow with the queries. A call that raises leaves the state unchanged.
 
     Example:
-        >>> from dejavu_torch import SpectralMapper
+        >>> from dejavu_torch import SequenceMatcher, SpectralMapper
         >>> wave = torch.sin(torch.arange(500.0)[:, None] * torch.tensor([0.1, 0.23, 0.37]))
         >>> localizer = Localizer(SpectralMapper()(wave), Matching(SequenceMatcher(3)))
         >>> localizer(wave[20:22]).index.tolist(), localizer(wave[22:23]).index.tolist()
