@@ -14,7 +14,7 @@ from benchmarks.measure import Row, done_once, truth_of, write_bench
 from benchmarks.plots import OURS, plot_areas
 from benchmarks.train import spread
 from dejavu_torch.data.source import open_source
-from dejavu_torch.evaluation.baselines import hog_baselines, matches_of
+from dejavu_torch.evaluation.baselines import hog_baselines
 from dejavu_torch.evaluation.contenders import COLOURS
 from dejavu_torch.evaluation.controls import null_control
 from dejavu_torch.evaluation.curves import evaluate
@@ -129,8 +129,7 @@ class Judge:
 
     def hog(self) -> Row:
         hog = hog_baselines(self.reference, self.query, 64, self.tolerance)
-        found = matches_of(hog)["hog"]
-        return self.row(HOG, found)
+        return self.row(HOG, hog["hog"].match())
 
 
 def run_trainings(

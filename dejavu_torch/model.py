@@ -34,7 +34,7 @@ from dejavu_torch.motion.resampling import ResampledTraverse, resampled, source_
 from dejavu_torch.places.layout import ROUTE, Layout
 from dejavu_torch.recognition.centring import PRIOR, centred, set_apart
 from dejavu_torch.recognition.coarse import searcher
-from dejavu_torch.recognition.localizer import Localizer, Matching, match_scores
+from dejavu_torch.recognition.localizer import Localizer, Matching
 from dejavu_torch.recognition.scorer import OfMap, Scorer
 from dejavu_torch.recognition.search import Scan, Search, Searcher, check_search
 from dejavu_torch.recognition.select import HIGHEST, PROBABLE, Acceptance, check_candidates
@@ -429,15 +429,16 @@ class DejaVu(nn.Module):
         """
         matching = matching if isinstance(matching, Matching) else self.matching(matching)
         localizer, smoother = self.localizer(matching), matching.sequence
+        plain = wrapped is None and matching.apart is None
+        if plain and not (smoother and smoother.whole):
+            match = localizer(descriptors, progress)
+            late = smoother is not None and smoother.lag
+            return Match.joined([match, localizer.finish()]) if late else match
         scorer: Scorer = OfMap(self.map, descriptors)
         scorer = scorer if wrapped is None else wrapped(scorer)
         if isinstance(smoother, PlaceSmoother):
             return localizer.drive(scorer, smoother, progress)
-        if wrapped is not None or matching.apart is not None:
-            return match_scores(scorer, matching, progress)
-        match = localizer(descriptors, progress)
-        late = smoother is not None and smoother.lag
-        return Match.joined([match, localizer.finish()]) if late else match
+        return localizer.match_all(scorer, progress)
 
     def loops(self, traverse: Source, apart: int = 50, drive: bool = True, progress: bool = False) -> Match:
         """Where a drive comes back to places that it has passed before: the best earlier place of each frame.

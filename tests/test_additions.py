@@ -13,7 +13,7 @@ from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.evaluation.matches import read_matches, write_matches
 from dejavu_torch.places.layout import KINDS
 from dejavu_torch.recognition.scorer import Earlier, OfMap, Reordered, Scorer, Wrapped
-from dejavu_torch.types import SequenceModel
+from dejavu_torch.types import InputError, SequenceModel
 
 LINES = 25
 
@@ -112,6 +112,27 @@ def test_a_baseline():
     assert report["bytes"] == 240
     assert report["sequences"]["smoother"]["recall_at_1"] >= report["recall_at_1"]
     assert "signs" in str(found.report)
+
+
+@pytest.mark.parametrize(
+    ("key", "queries", "truth", "line"),
+    [
+        ("null", 120, "0", "the contender 'null'; expected a key that is not taken"),
+        (
+            "signs",
+            60,
+            "0",
+            "the contender 'signs' scores 60 queries at 120 places; expected 120 queries",
+        ),
+        ("signs", 120, None, "there is none to judge contenders by; expected a truth"),
+    ],
+)
+def test_a_baseline_of_other_queries_is_refused_before_anything_is_learned(key, queries, truth, line):
+    reference, query, learned = waves(0), waves(1), model()
+    scorer = Signs(reference, ArrayTraverse(query[:queries]))
+    with pytest.raises(InputError, match=line):
+        compare(reference, query, truth, learned, contenders={key: ("signs", 240, scorer)}, ordered=True)
+    assert learned.map.places == 0
 
 
 class Without(Wrapped):

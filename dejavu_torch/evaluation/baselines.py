@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, NamedTuple
@@ -27,7 +27,7 @@ from dejavu_torch.model import DejaVu
 from dejavu_torch.model_file import recipe_of
 from dejavu_torch.motion.resampling import ResampledTraverse
 from dejavu_torch.places.layout import ROUTE, Layout
-from dejavu_torch.recognition.drive import localize_drives
+from dejavu_torch.recognition.drive import DriveQuery, localize_drives
 from dejavu_torch.recognition.localizer import SINGLE, Matching, drive_query, match_scores
 from dejavu_torch.recognition.scorer import OfMap, OfStored, Reordered, Scorer
 from dejavu_torch.recognition.smoother import PlaceSmoother
@@ -48,7 +48,7 @@ class Baseline(NamedTuple):
 
     name: for tables. scorer: of the same queries. bytes: in all. k: the stride, if every k-th frame is
     stored. fixed: the part of the bytes that does not grow with the route, such as a backbone. found: the
-    matches, where scores do not tell them. asks: see `DriveQuery`.
+    matches, if they are known. asks: see `DriveQuery`. removed: see `PlaceSmoother`; None as of the run.
     """
 
     name: str
@@ -58,32 +58,37 @@ class Baseline(NamedTuple):
     fixed: int = 0
     found: Match | None = None
     asks: bool = False
+    removed: float | None = None
+
+    def match(self, matching: Matching = SINGLE, progress: bool = False) -> Match:
+        """The matches of its scores, unless they are known."""
+        if self.found is not None:
+            return self.found
+        assert self.scorer is not None
+        return replace(match_scores(self.scorer, matching, progress, "baselines"), probability=None)
 
 
-def matches_of(
-    baselines: Mapping[str, Baseline],
+def matched(
+    baselines: Iterable[tuple[str, Baseline]],
     matching: Matching = SINGLE,
     smoother: PlaceSmoother | None = None,
-    driven: Collection[str] = (),
+    driven: Collection[str] | None = (),
     progress: bool = False,
-) -> dict[str, Match]:
-    """The matches of baselines, and of those that are `driven` those of a smoother, all in one pass."""
-    found = dict[str, Match]()
-    for key, one in baselines.items():
-        if one.found is not None:
-            found[key] = one.found
-        elif one.scorer is not None:
-            found[key] = replace(match_scores(one.scorer, matching, progress, "baselines"), probability=None)
-    if smoother is None:
-        return found
-    asked = {
-        key: drive_query(one.scorer, smoother, one.asks)
-        for key, one in baselines.items()
-        if one.scorer is not None and key in driven
-    }
+) -> dict[str, tuple[Baseline, Match]]:
+    """Baselines and their matches, without their descriptors but while a smoother drives them.
+
+    Args:
+        driven: keys of those that are also matched by the smoother, all in one pass; None are all.
+    """
+    found, asked = dict[str, tuple[Baseline, Match]](), dict[str, DriveQuery]()
+    for key, one in baselines:
+        found[key] = one._replace(scorer=None), one.match(matching, progress)
+        if one.scorer is not None and smoother is not None and (driven is None or key in driven):
+            asked[key] = drive_query(one.scorer, smoother, one.asks, one.removed)
+        del one  # its descriptors, before those of the next
     for key, drive in zip(asked, localize_drives([*asked.values()], progress), strict=True):
-        best = drive.map(lambda column: column[:, 0])
-        found[key] = replace(found[key], sequences={**found[key].sequences, "smoother": best})
+        (one, match), best = found[key], drive.map(lambda column: column[:, 0])
+        found[key] = one, replace(match, sequences={**match.sequences, "smoother": best})
     return found
 
 
@@ -193,8 +198,9 @@ def quantised_every_kth(
 
 def baselines_of(
     run: Localization, seed: int = 0, leave_out: int | None = None, progress: bool = False
-) -> dict[str, Baseline]:
-    """The baselines and null controls of a run, by their keys in report.json (convention 8).
+) -> Iterator[tuple[str, Baseline]]:
+    """The baselines and null controls of a run, each when it is asked for, with their keys in report.json
+    (convention 8).
 
     Args:
         seed: for shuffling the null controls.
@@ -219,20 +225,22 @@ def baselines_of(
     size, own = partial(stride_bytes, frames, dimension, layout=layout), reference.element_size()
     if spectral:
         short, name, strided = as_int8(reference), "its descriptors", f"{every(coarsest, one)}, int8"
-        found = _in_one_byte(run, one) if summary.route_bytes >= 1.5 * frames else {}
-        found["uncompressed"] = nearest(f"{name}, {every(1, one)}, float", reference, 1, size(4, 1))
         if is_ready(run.reference):
-            found = _as_given(run, summary.route_bytes / frames, seed, one, progress) | found
-        else:
+            yield from _as_given(run, summary.route_bytes / frames, seed, one, progress).items()
+        if summary.route_bytes >= 1.5 * frames:
+            yield from _in_one_byte(run, one).items()
+        yield "uncompressed", nearest(f"{name}, {every(1, one)}, float", reference, 1, size(4, 1))
+        if not is_ready(run.reference):
             coded = quantised_every_kth(reference, summary.route_bytes / frames, coarsest // 2, layout, seed)
             restored, k, taken, books, _ = coded
             quantiser = f"{name}, {every(k, one)}, product quantiser"
-            found["product_quantiser"] = nearest(quantiser, restored, k, taken, k, books)
-        found["stride"] = nearest(f"{name}, {strided}", short, coarsest, size(1, coarsest), coarsest)
+            yield "product_quantiser", nearest(quantiser, restored, k, taken, k, books)
+            del coded, restored
+        yield "stride", nearest(f"{name}, {strided}", short, coarsest, size(1, coarsest), coarsest)
         if INTERPOLATES[layout.dimensions]:
             between, spaced, keys = interpolated(short, summary.route_bytes)
             interpolating = f"{name}, {every(spaced, one)}, interpolated"
-            found["interpolated"] = nearest(interpolating, between, spaced, keys * dimension)
+            yield "interpolated", nearest(interpolating, between, spaced, keys * dimension)
     else:
         fair = fair_stride(frames, dimension, own, summary.map_bytes - fixed, run.tolerance)
         name = "" if isinstance(model.features, HOG) else "same features, "
@@ -242,23 +250,23 @@ def baselines_of(
             "stride": (f"{name}{every(fair, one)} (at least the map's bytes)", fair),
             "stride_coarsest": (f"{name}{every(coarsest, one)} (2 x tolerance)", coarsest),
         }
-        found = {key: nearest(name, reference, k, size(own, k), k) for key, (name, k) in names.items()}
+        for key, (name, k) in names.items():
+            yield key, nearest(name, reference, k, size(own, k), k)
 
-    found |= _null_controls(run, seed, one)
+    yield from _null_controls(run, seed, one).items()
     if leave_out is not None:
         itself = leave_out_match(model, reference, leave_out)
         itself = replace(itself, accepted=itself.score.isfinite())
-        found["leave_out"] = Baseline(f"reference on itself, +-{leave_out} left out", None, found=itself)
+        yield "leave_out", Baseline(f"reference on itself, +-{leave_out} left out", None, found=itself)
     pair, batch = (run.reference, run.asked), model.batch_size
     if not _is_plain_hog(model):
         same = recipe_of(model.preprocess) == recipe_of(Preprocess())
         known = [model.descriptor.hog_of(traverse) for traverse in pair] if same else []
-        found |= hog_baselines(*pair, batch, run.coarsest // 2, progress, known)
+        yield from hog_baselines(*pair, batch, run.coarsest // 2, progress, known).items()
     if run.sequence is not None:  # SeqSLAM compares the grey pixels of small frames by L1
         plain = DejaVu(PatchPixels(), "none", batch_size=batch, preprocess=Preprocess("grey"))
         names = {"seqslam": ("SeqSLAM's pixels: grey, patches normalised", 1)}
-        found |= _described_baselines(plain, names, pair, progress)
-    return found
+        yield from _described_baselines(plain, names, pair, progress).items()
 
 
 def _in_one_byte(run: Localization, one: str) -> dict[str, Baseline]:
@@ -280,11 +288,11 @@ def _as_given(run: Localization, each: float, seed: int, one: str, progress: boo
     """Descriptors of another program as they are, by cosine: all of them, and in `each` bytes per frame."""
     plain = DejaVu(whitening="none", batch_size=run.model.batch_size)
     stored, queries = (plain.descriptor.all_of(one, progress) for one in (run.reference, run.query))
-    stored = normalize(stored.float())
-    restored, k, taken, books, _ = quantised_every_kth(stored, each, run.coarsest // 2, seed=seed)
+    stored, layout = normalize(stored.float()), run.model.map.layout
+    restored, k, taken, books, _ = quantised_every_kth(stored, each, run.coarsest // 2, layout, seed)
 
     def baseline(name: str, rows: Tensor, bytes: int, k: int = 1, fixed: int = 0) -> Baseline:
-        scorer = OfStored(rows, queries, k, "cosine", run.model.map.layout)
+        scorer = OfStored(rows, queries, k, "cosine", layout)
         return Baseline(f"your descriptors, {every(k, one)}{name}", scorer, bytes + fixed, k, fixed)
 
     return {

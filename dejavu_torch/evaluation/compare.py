@@ -28,8 +28,8 @@ from dejavu_torch.data.ground_truth import (
 from dejavu_torch.data.source import Source, as_traverse
 from dejavu_torch.data.traverse import fitted, kept
 from dejavu_torch.data.turning import Turned, facing_north
-from dejavu_torch.evaluation.baselines import Baseline, baselines_of, matches_of
-from dejavu_torch.evaluation.contenders import Contender, contend, models_beside
+from dejavu_torch.evaluation.baselines import Baseline, baselines_of, matched
+from dejavu_torch.evaluation.contenders import COLOURS, Contender, contend, models_beside
 from dejavu_torch.evaluation.evaluate import RANKS
 from dejavu_torch.evaluation.facts import facts_of, match_facts, metric_facts, peak_memory
 from dejavu_torch.evaluation.localization import NOTHING, Localization
@@ -130,7 +130,8 @@ def compare(
         others: further models that learn the same reference, by their keys in report.json, with their names
             in tables. They need a ground truth, and none of them resamples.
         contenders: further ways to store the route, by their keys in report.json: a name for tables, bytes,
-            and a `Scorer` of the same queries.
+            and a `Scorer` of the same queries, with `headings` of all their turned copies. They need a ground
+            truth.
         sequence: how the answers are found, see `DejaVu.localize`; within how many places, says `reach_of`.
             With a filter or a `SequenceMatcher` the scores at top level are those of its answers, else of
             single queries.
@@ -181,6 +182,7 @@ def compare(
     # without a given truth, each place would be its own answer
     known = None if itself and truth is None else ground_truth_of(truth, reference, query, interpolate)
     expect(known is not None or not storage_curve, "a truth", "there is none to judge a storage curve by")
+    _check_contenders(contenders or {}, known is not None, len(query) * headings, len(reference))
     if known is not None and near is None and within > tolerance:
         known = widened(known, layout, within)
 
@@ -271,6 +273,16 @@ def _check_settings(
     if truth is not None:
         check_ground_truth(truth, interpolate)
     check_candidates(top, tolerance)
+
+
+def _check_contenders(contenders: Contenders, judged: bool, queries: int, places: int) -> None:
+    """Refuse scores of others than these queries and places, and what would stand for an own entry."""
+    expect(judged or not contenders, "a truth", "there is none to judge contenders by")
+    for key, (_, _, scorer) in contenders.items():
+        expect(key not in COLOURS, "a key that is not taken", f"the contender {key!r}")
+        seen = f"the contender {key!r} scores {len(scorer)} queries at {scorer.layout.places} places"
+        right = (len(scorer), scorer.layout.places) == (queries, places)
+        expect(right, f"{queries} queries at {places} places", seen)
 
 
 def _check_storage(model: DejaVu, storage_curve: bool, headings: int) -> None:
@@ -488,18 +500,22 @@ def _other_contenders(
     drives too."""
     table, judged = run.model.map.table, run.truth is not None
     itself = table.scored(torch.arange(table.places))[:, None]  # of the places as queries
-    found = baselines_of(run, seed, leave_out, progress) if judged or leave_out is not None else {}
-    found |= given if judged else {}
-    for key, (name, other) in others.items() if judged else ():
-        other.learn(run.reference, progress)
-        queries, size = run.described_by(other, progress), other.summary()
-        match = other.localize_descriptors(queries, run.matching, progress=progress)
-        sizes = size.map_bytes, None, size.fixed_bytes
-        found[key] = Baseline(name, OfMap(other.map, queries), *sizes, match, asks=True)
-    driven = found if drives else DRIVEN
+
+    def further() -> Iterator[tuple[str, Baseline]]:
+        if judged or leave_out is not None:
+            yield from baselines_of(run, seed, leave_out, progress)
+        yield from given.items()
+        for key, (name, other) in others.items() if judged else ():
+            other.learn(run.reference, progress)
+            queries, size = run.described_by(other, progress), other.summary()
+            match = other.localize_descriptors(queries, run.matching, progress=progress)
+            sizes, removed = (size.map_bytes, None, size.fixed_bytes), other.matching(PlaceSmoother()).removed
+            yield key, Baseline(name, OfMap(other.map, queries), *sizes, match, True, removed)
+
     contenders = {}
-    for key, match in matches_of(found, run.matching, run.beside, driven, progress).items():
-        truth, one = itself if key == "leave_out" else run.truth, found[key]
+    found = matched(further(), run.matching, run.beside, None if drives else DRIVEN, progress)
+    for key, (one, match) in found.items():
+        truth = itself if key == "leave_out" else run.truth
         known = match.renumbered(table.scored), truth, run.tolerance
         contenders[key] = contend(one.name, *known, one.bytes, one.k, one.fixed)
     return contenders

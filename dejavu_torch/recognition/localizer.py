@@ -149,11 +149,7 @@ class Localizer:
             match = Match.joined(self._search(part, wanted) for part in moved)
         else:
             match = Match.joined(self.match(place_map.scores(part), self._mirrored(part)) for part in moved)
-        # blank frames find nothing by themselves
-        if matching.sequence is None and getattr(place_map, "metric", "") == "cosine":
-            shows = descriptors[:: matching.copies].any(1).cpu()
-            match = replace(match, accepted=match.accepted & shows.view(-1, *[1] * (match.accepted.ndim - 1)))
-        return match
+        return self._without_blank(match, descriptors[:: matching.copies])
 
     def _mirrored(self, descriptors: Tensor) -> Tensor | None:
         """Confidences in some of the queries, mirrored, (B,), NaN for the others, if a filter's answers get
@@ -207,12 +203,30 @@ class Localizer:
         # whose scores are distances
         if acceptance.threshold is not None and not smoother.is_drive and not asked.checks:
             acceptance = Acceptance(precision=math.exp(-acceptance.threshold))
-        if self.matching.copies > 1:
-            each = max(1, SCORES_AT_ONCE // (self.matching.copies * scorer.layout.places))
-            parts = zip(torch.arange(len(scorer)).split(each), match.index.split(each), strict=True)
-            turn = torch.cat([match.index[:0], *(scorer.copy_at(*part) for part in parts)])
-            match = replace(match, heading=self._heading_of(turn, match.index))
-        return self._accepted(match, acceptance)
+        return self._accepted(self._turned(scorer, match), acceptance)
+
+    def match_all(self, scorer: Scorer, progress: bool = False) -> Match:
+        """Match all queries by their scores, each by itself, or by a sequence or filter."""
+        match = match_scores(scorer, self.matching, progress)
+        scorer = wrapped(scorer, self.matching)
+        return self._without_blank(self._turned(scorer, match), scorer.descriptors)
+
+    def _turned(self, scorer: Scorer, match: Match) -> Match:
+        """The match with its headings, if there are copies of the queries."""
+        if self.matching.copies == 1:
+            return match
+        each = max(1, SCORES_AT_ONCE // (self.matching.copies * scorer.layout.places))
+        index = match.index.view(len(scorer), -1 if len(scorer) else 1)
+        parts = zip(torch.arange(len(scorer)).split(each), index.split(each), strict=True)
+        turn = torch.cat([index[:0], *(scorer.copy_at(*part) for part in parts)]).view_as(match.index)
+        return replace(match, heading=self._heading_of(turn, match.index))
+
+    def _without_blank(self, match: Match, descriptors: Tensor) -> Match:
+        """The match, in which blank frames find nothing by themselves; descriptors (B,K)."""
+        if self.matching.sequence is not None or getattr(self.place_map, "metric", "") != "cosine":
+            return match
+        shows = descriptors.any(1).cpu().view(-1, *[1] * (match.accepted.ndim - 1))
+        return replace(match, accepted=match.accepted & shows)
 
     def _heading_of(self, turn: Tensor, index: Tensor) -> Tensor:
         """The heading of copies in degrees, NaN where the place `index` is -1."""
@@ -237,7 +251,7 @@ class Localizer:
     @torch.no_grad()
     def finish(self) -> Match:
         """The answers that a `PlaceFilter` with a lag still owes, after the last query; else none."""
-        places = 1 if self.place_map is None else self.place_map.places
+        places = max(1, self.layout.places)
         if self.matching.sequence is None or not self.matching.sequence.lag or not self.states:
             return self.match(torch.zeros(0, places))
         match = self._in_sequence(self.states[self.own].new_zeros(0, places), last=True)
@@ -333,10 +347,13 @@ def wrapped(scorer: Scorer, matching: Matching) -> Scorer:
     return scorer if matching.apart is None else Earlier(scorer, matching.apart)
 
 
-def drive_query(scorer: Scorer, smoother: PlaceSmoother, asks: bool = False) -> DriveQuery:
-    """Queries as a drive with scores of any kind, for a smoother like this one."""
+def drive_query(
+    scorer: Scorer, smoother: PlaceSmoother, asks: bool = False, removed: float | None = None
+) -> DriveQuery:
+    """Queries as a drive with scores of any kind, for a smoother like this one; `removed`: unless its own."""
     smoother = copy.deepcopy(smoother)
-    smoother.map_links = scorer.links
+    own = smoother.removed if removed is None else removed
+    smoother.map_links, smoother.removed = scorer.links, own
     return DriveQuery(scorer, smoother, radius=0, asks=asks)
 
 
@@ -365,6 +382,8 @@ def match_scores(
             sequences = {T: one if T == 1 else several for T, several in match.sequences.items()}
             match = replace(one if single else match, sequences=sequences)
         parts.append(match)
+    if matching.sequence is not None and matching.sequence.lag:
+        parts.append(matcher.finish())
     return Match.joined(parts)
 
 

@@ -1,6 +1,6 @@
 """Scores of queries at places, computed where they are read: of a map, of stored frames, and wrapped.
 
-Wrappers are composed from inside out: `Reordered`, `Earlier`, `BestOf`.
+Wrappers are composed from inside out: `Reordered`, `BestOf`, `Earlier`.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class Scorer(ABC):
             a drive, by at least `least` nats for each query.
         at_once: numbers that are computed together. stored: the places that are stored themselves, (n,), if
             others have the scores of these. uncentred: of the same queries as they are, for ways that do not
-            know all of them; None if these are.
+            know all of them; None if these are. It belongs to the outermost: wrappers do not pass it on.
     """
 
     layout: Layout
@@ -117,6 +117,7 @@ class OfStored(Scorer):
         self, frames: Tensor, queries: Tensor, k: int = 1, metric: Metric = "l1", layout: Layout = ROUTE
     ) -> None:
         self.layout, self.descriptors, self.metric = layout.reaching(len(frames)), queries, metric
+        self.links = self.layout.joins
         self.frames, self.nearest = frames, None
         if k > 1:
             self.stored, nearest = self.layout.strided(k)
@@ -168,14 +169,19 @@ class Wrapped(Scorer):
 
 
 class Reordered(Wrapped):
-    """Scores of a map whose places are the frames `order` (N,), frame by frame."""
+    """Scores of a map whose places are the frames `order` (N,), frame by frame. Of a shuffled map, a control,
+    nothing is asked first: its order is lost."""
 
     def __init__(self, scorer: Scorer, order: Tensor) -> None:
         super().__init__(scorer)
-        self.place = order.argsort()
+        self.place, self.null, self.least = order.argsort(), None, 0.0
+        self.stored = None if scorer.stored is None else order[scorer.stored.to(order.device)]
 
     def changed(self, scores: Tensor, queries: Tensor) -> Tensor:
         return scores[:, self.place.to(scores.device)]
+
+    def copy_at(self, queries: Tensor, places: Tensor) -> Tensor:
+        return self.scorer.copy_at(queries, self.place.to(places.device)[places.clamp(min=0)])
 
 
 class Earlier(Wrapped):
@@ -207,7 +213,7 @@ class BestOf(Wrapped):
         return scores.view(-1, self.copies, scores.shape[1]).amin(1)
 
     def copy_at(self, queries: Tensor, places: Tensor) -> Tensor:
-        scores = self.scorer.rows(self.asked(queries)).cpu().view(len(queries), self.copies, -1)
+        scores = self.scorer.rows(self.asked(queries)).cpu().view(-1, self.copies, self.layout.places)
         at = places.clamp(min=0)[:, None].expand(-1, self.copies, -1)
         return scores.gather(2, at).argmin(1)
 

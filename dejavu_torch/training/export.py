@@ -13,7 +13,7 @@ from pytorch_lightning.callbacks import Callback, ModelCheckpoint
 
 from dejavu_torch.data.ground_truth import GroundTruth, as_ground_truth
 from dejavu_torch.data.traverse import fitted
-from dejavu_torch.evaluation.baselines import hog_baselines, matches_of
+from dejavu_torch.evaluation.baselines import hog_baselines
 from dejavu_torch.evaluation.contenders import contend
 from dejavu_torch.evaluation.curves import Scores
 from dejavu_torch.features.preprocess import Preprocess
@@ -154,7 +154,7 @@ def compare_with_untrained(
     query = _of_shape(query, reference.frame_shape)
     found = {TRAINED: _match(model, query)}
     hog = hog_baselines(reference, query, model.batch_size, tolerance)
-    found |= {HOG: matches_of(hog)["hog"]} if hog else {}
+    found |= {HOG: hog["hog"].match()} if hog else {}
     mapper = None if isinstance(model.mapper, TemplateMapper) else copy.deepcopy(model.mapper)
     if isinstance(mapper, SpectralMapper) and mapper.route_bytes_per_place is None:
         # the same step would give other bytes for another descriptor

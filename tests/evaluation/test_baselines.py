@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
+import weakref
+
 import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from dejavu_torch import DejaVu, SpectralMapper, compare
+from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.evaluation.baselines import (
+    Baseline,
+    baselines_of,
     every,
     fair_stride,
+    matched,
     nearest_frames,
     quantised_every_kth,
     stored_frames,
@@ -148,6 +155,33 @@ def test_a_product_quantiser_of_an_area_skips_rows_and_columns():
     stored = len(stored_frames(area.places, found.k, area)[0])
     assert stored == -(-9 // found.k) * -(-12 // found.k)
     assert found.bytes % stored == 0
+
+
+def test_the_bytes_of_coded_frames_of_an_area_are_those_of_the_frames_that_are_asked():
+    rows = torch.randn(30 * 29, 16, generator=torch.Generator().manual_seed(0))
+    reference, query = ArrayTraverse(rows), ArrayTraverse(rows + 0.2)
+    reference.layout = query.layout = Layout(30, 29)
+    model = DejaVu(None, "none", mapper=SpectralMapper(0.5))
+    run = compare(reference, query, "0", model, sequence=None, tolerance=2, calibration="none").run
+    coded = dict(baselines_of(run))["product_quantiser"]
+    assert coded.k == 3
+    assert len(coded.scorer.stored) == 10 * 10
+    assert coded.bytes - coded.fixed == 10 * 10 * 4  # of four codes
+
+
+def test_one_baseline_at_a_time_is_in_memory():
+    alive = weakref.WeakSet()
+
+    def baselines():
+        for key in "abc":
+            assert not alive, "the one before is still there"
+            scorer = OfStored(torch.randn(30, 4), torch.randn(9, 4))
+            alive.add(scorer)
+            yield key, Baseline(key, scorer)
+            del scorer
+
+    found = matched(baselines())
+    assert {key: len(match.index) for key, (_, match) in found.items()} == dict.fromkeys("abc", 9)
 
 
 def test_codebooks_of_another_route_are_learned_there():

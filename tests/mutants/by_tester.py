@@ -244,8 +244,8 @@ MUTANTS = [
     Mutant(
         "Without --drives all only float and control are matched as whole drives.",
         "dejavu_torch/evaluation/compare.py",
-        "driven = found if drives else DRIVEN",
-        "driven = found",
+        "None if drives else DRIVEN",
+        "None",
         ("tests/evaluation/test_compare.py::-k stands_beside_single",),
     ),
     Mutant(

@@ -7,10 +7,10 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dejavu_torch import DejaVu, Layout, SpectralMapper
+from dejavu_torch import DejaVu, Layout, PlaceFilter, PlaceSmoother, SpectralMapper
 from dejavu_torch.maps.distance import phase_distances
-from dejavu_torch.recognition.localizer import Matching, match_scores
-from dejavu_torch.recognition.scorer import BestOf, Earlier, OfMap, OfRows, OfStored, Reordered
+from dejavu_torch.recognition.localizer import Matching, drive_query, match_scores
+from dejavu_torch.recognition.scorer import BestOf, Earlier, OfMap, OfRows, OfStored, Reordered, Wrapped
 
 
 def noise(*shape, seed=0):
@@ -62,13 +62,51 @@ def test_wrappers_commute_where_they_have_nothing_to_do_with_each_other(copies, 
     assert torch.equal(one.rows(every), other.rows(every))
     best = scores.view(6, copies, 9).amin(1)
     assert torch.equal(one.rows(every)[:, torch.arange(9)], best[:, order.argsort()])
-    assert torch.equal(one.null(every, seed=2), one.rows(every) + 2)
+    assert one.null is other.null is None  # a shuffled map has no order to ask for
+    assert torch.equal(BestOf(inner, copies).null(every, seed=2), best + 2)
     places = one.rows(every).topk(2, 1, largest=False).indices
     turn = BestOf(inner, copies).copy_at(every, order.argsort()[places])
     at = scores.view(6, copies, 9).gather(2, order.argsort()[places][:, None].expand(-1, copies, -1))
     assert torch.equal(turn, at.argmin(1))
     assert torch.equal(one.copy_at(every, places), turn)
+    assert torch.equal(other.copy_at(every, places), turn)
     assert torch.equal(one.descriptors, inner.descriptors[::copies])
+
+
+def test_frames_that_are_stored_keep_their_numbers_in_another_order():
+    order = torch.randperm(30, generator=torch.Generator().manual_seed(0))
+    frames = noise(30, 4)
+    scorer = Reordered(OfStored(frames[order], noise(50, 4, seed=1), 4), order)
+    assert sorted(scorer.stored.tolist()) == sorted(order[::4].tolist())
+    assert torch.isin(match_scores(scorer).index, order[::4]).all()
+
+
+@pytest.mark.parametrize(
+    "matching", [Matching(), Matching(PlaceFilter(lag=3)), Matching(copies=2, k=3), Matching(copies=2)]
+)
+def test_a_wrapper_that_changes_nothing_changes_no_answer(place_map, matching):
+    model = DejaVu(None, "none")
+    model.map = place_map
+    queries = noise(90, 6, seed=1) + 0.3 * noise(90, 6, seed=2)
+    queries[10:14] = 0  # blank
+    plain = model.localize_descriptors(queries, matching)
+    wrapped = model.localize_descriptors(queries, matching, Wrapped)
+    torch.testing.assert_close(
+        plain.score, wrapped.score, atol=1e-4, rtol=0
+    )  # almost alike are in either order
+    assert (plain.index == wrapped.index).double().mean() > 0.95
+    assert torch.equal(plain.accepted, wrapped.accepted)
+    assert (plain.heading is None) == (wrapped.heading is None)
+    if plain.heading is not None:
+        assert (plain.heading == wrapped.heading).double().mean() > 0.9
+
+
+def test_a_drive_has_the_share_of_the_mean_that_its_scores_need():
+    scorer, smoother = OfRows(noise(9, 5).__getitem__, noise(9, 3), Layout(5)), PlaceSmoother()
+    smoother.removed = 0.25
+    assert drive_query(scorer, smoother).smoother.removed == 0.25
+    assert drive_query(scorer, smoother, removed=0.5).smoother.removed == 0.5
+    assert smoother.removed == 0.25
 
 
 def test_only_earlier_places_answer_and_blank_queries_find_none():
