@@ -42,6 +42,7 @@ from dejavu_torch.recognition.localizer import Matching
 from dejavu_torch.recognition.motion import Rates
 from dejavu_torch.recognition.plane import Followed, PlaneMotion
 from dejavu_torch.recognition.samples import RowSearch
+from dejavu_torch.recognition.scorer import OfRows
 from dejavu_torch.recognition.search import Scan
 from dejavu_torch.recognition.select import best_candidates
 from dejavu_torch.recognition.smoother import log_likelihood
@@ -391,6 +392,11 @@ def test_a_flight_is_found_where_single_images_are_not():
     elsewhere, away = smooth(30, 40, seed=9), PlaceSmoother()
     model.localize_descriptors(elsewhere[truth], away)
     assert not away.is_drive  # over other ground
+    noise, unsure = torch.randn(90, own.shape[1], generator=draw), PlaceSmoother()
+    bare = lambda scorer: OfRows(scorer.rows, scorer.descriptors, area)  # noqa: E731 whose images are not asked
+    model.localize_descriptors(own[truth] + 0.8 * noise, unsure, bare)
+    assert 0.05 < unsure.nats_per_query < 0.2
+    assert not unsure.is_drive  # by too little for each image
 
 
 def ground(side, seed=0, light=0.0):

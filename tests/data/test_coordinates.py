@@ -75,11 +75,11 @@ def test_poses_with_times(unit, sign, tmp_path):
 
 
 def test_rows_by_time(tmp_path):
-    folder = images(tmp_path / "a", "100.25.png", "101.0.png", "103.0.png", "105.png")
+    folder = images(tmp_path / "a", "100.25.png", "101.0.png", "102.0.png", "103.0.png", "105.png")
     found = values(
         "time,x,y\n100,7,2\n100.5,8,4\n101,9,6\n103,1,1\n104.5,2,2\n", open_source(folder), tmp_path
     )
-    np.testing.assert_allclose(found, [[7.5, 3], [9, 6], [1, 1], [NAN, NAN]])
+    np.testing.assert_allclose(found, [[7.5, 3], [9, 6], [NAN, NAN], [1, 1], [NAN, NAN]])
     for text, words in (
         ("time,x,y\n2,0,0\n1,0,0\n", ("do not rise",)),
         ("time,x,y\nnoon,0,0\n", ("a row without a time",)),

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import torch
 from helpers import refused
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from dejavu_torch.maps import codec, compiling
@@ -29,6 +29,8 @@ def levels(rows=200, columns=7, spread=3.0):
 @given(
     st.integers(1, 40), st.integers(1, 20), st.sampled_from([0.1, 3.0, 60.0, 500.0, 2e9]), st.integers(0, 99)
 )
+@example(1, 1, 500.0, 0)  # 770 alone, with no negative level beside it
+@example(1, 1, 500.0, 2)  # 196
 def test_a_stream_gives_the_levels_back(rows, columns, spread, seed):
     random = torch.randn(rows, columns, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
     own = (random * spread).round().clamp(1 - 2**31, 2**31 - 1).to(torch.int32)

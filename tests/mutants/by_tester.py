@@ -721,7 +721,7 @@ MUTANTS = [
         "dejavu_torch/recognition/drive.py",
         "known.is_drive &= known.singly.stands_out",
         "pass",
-        ("tests/recognition/test_taken.py::-k other_ground",),
+        ("tests/recognition/test_taken.py::-k mirrored_queries_find",),
     ),
     Mutant(
         "A stop counts once where single images are asked.",

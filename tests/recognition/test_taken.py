@@ -14,6 +14,7 @@ from dejavu_torch.growth import learn_mean
 from dejavu_torch.recognition import taken
 from dejavu_torch.recognition.calibration import Platt
 from dejavu_torch.recognition.localizer import Localizer
+from dejavu_torch.recognition.scorer import OfRows
 from dejavu_torch.recognition.taken import (
     OF_AREA,
     Running,
@@ -162,6 +163,19 @@ def test_other_ground_is_no_drive_although_its_frames_are_in_order(model):
         assert not other.singly.stands_out
         assert other.settled()["taken"] is False
         assert float((match.probability >= 0.5).double().mean()) <= 0.02
+
+
+def test_a_drive_whose_mirrored_queries_find_the_map_as_well_is_none(model):
+    own = seen_again(walk(400, 0)[50:350], 5)
+    for mirrored, drives in (None, True), (lambda scorer: lambda queries, seed: scorer.rows(queries), False):
+        smoother = PlaceSmoother()
+
+        def asks(scorer, mirrored=mirrored):
+            null = None if mirrored is None else mirrored(scorer)
+            return OfRows(scorer.rows, scorer.descriptors, scorer.layout, null)
+
+        model.localize_descriptors(own, model.matching(smoother), asks)
+        assert smoother.is_drive is drives
 
 
 def test_a_part_over_the_map_is_a_drive(model):
