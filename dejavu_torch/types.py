@@ -343,8 +343,8 @@ class SequenceModel(nn.Module, ABC):
             single queries and for a filter.
         whole: whether it needs all queries, as of a drive.
         length, speeds: queries that it sums over, and places that pass from one to the next, if it has these.
-        lag: queries by which its answers come later. These five are plain attributes, no parameters or
-            buffers.
+        lag: queries by which its answers come later. Parameters and buffers need other names
+            than these five.
 
     Convention: each score is for the place of its own query. All but those of a `whole` drive are causal, and
         their memory does not grow with the queries.

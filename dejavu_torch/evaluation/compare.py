@@ -130,8 +130,8 @@ def compare(
         others: further models that learn the same reference, by their keys in report.json, with their names
             in tables. They need a ground truth, and none of them resamples.
         contenders: further ways to store the route, by their keys in report.json: a name for tables, bytes,
-            and a `Scorer` of the same queries, with `headings` of all their turned copies. They need a ground
-            truth.
+            and a `Scorer` of the same queries, or with `headings` of all their turned copies. They need a
+            ground truth.
         sequence: how the answers are found, see `DejaVu.localize`; within how many places, says `reach_of`.
             With a filter or a `SequenceMatcher` the scores at top level are those of its answers, else of
             single queries.

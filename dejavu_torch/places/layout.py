@@ -61,8 +61,7 @@ class Layout:
         rectangles: in the order of the places. routes: the names of several routes; () of a single one.
         dimensions: 1 along routes, 2 over areas; what is tuned for each is a table by it, beside its user.
         places, count: N, and the number of routes. runs, starts: those of consecutive places of one
-            route, and the first place of each. rows,
-            columns: of a plane in which all lie, lattices apart
+            route, and the first place of each. rows, columns: of a plane in which all lie, lattices apart
             from each other; not all rows and columns are places.
 
     Convention: places are numbered tile by tile and in a tile row by row, so that a tile is a run of places.
