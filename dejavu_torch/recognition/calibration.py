@@ -239,10 +239,8 @@ def calibrated(
     platts: list[Platt | None] = []
     for rows in answers:
         confidences, right, on_the_map = map(torch.cat, zip(*rows, strict=True))
-        wrong = int((on_the_map & ~right).sum())
-        off_weight = max(0, MIN_WRONG - wrong) / max(1, int((~on_the_map).sum())) if another_visit else 1.0
-        weight = torch.where(on_the_map, 1.0, confidences.new_tensor(off_weight))
-        platts.append(fit(confidences, right, weight) if not platts or bool(right.any()) else None)
+        sure, p, off = confidences[on_the_map], right[on_the_map].double(), confidences[~on_the_map]
+        platts.append(_fit_all(sure, p, off, another_visit) if not platts or bool(right.any()) else None)
         if own is not None and len(platts) == 1 and platts[0] is not None:
             known = torch.where(right, confidences, -math.inf)[on_the_map]
             scores = torch.cat([place_map.scores(part) for part in own[0].split(64)])
@@ -301,9 +299,15 @@ def calibrated_by_drive(
     platts = []
     for (_, sure, off), masses in zip((single, filtered), right, strict=True):
         known, p = torch.cat(sure).double(), torch.cat(masses[::-1]).clamp(0, 1)
-        hidden = torch.cat(off).double()
-        weight = max(0.0, MIN_WRONG - float((1 - p).sum())) / max(1, len(hidden))
-        labels = torch.cat([torch.ones(len(p)), torch.zeros(len(p) + len(hidden))]).bool()
-        weights = torch.cat([p, 1 - p, torch.full_like(hidden, weight)])
-        platts.append(fit(torch.cat([known, known, hidden]), labels, weights))
+        platts.append(_fit_all(known, p, torch.cat(off).double()))
     return Calibration(*platts)
+
+
+def _fit_all(sure: Tensor, p: Tensor, off: Tensor, another_visit: bool = True) -> Platt:
+    """Fit to confidences in answers that are right with probabilities p, (n,) each, and in answers off the
+    map, which weigh, in total, what another visit lacks to `MIN_WRONG` wrong ones, else as much as others."""
+    weight = max(0.0, MIN_WRONG - float((1 - p).sum())) / max(1, len(off)) if another_visit else 1.0
+    weights = torch.cat([p, 1 - p, torch.full_like(off, weight, dtype=p.dtype)])
+    labels = torch.arange(len(weights)) < len(p)
+    some = weights > 0
+    return fit(torch.cat([sure, sure, off])[some], labels[some], weights[some])
