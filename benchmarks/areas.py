@@ -23,8 +23,8 @@ from dejavu_torch.evaluation.controls import shuffled
 from dejavu_torch.evaluation.plots import Plot, legend
 from dejavu_torch.evaluation.quantiser import product_quantised
 from dejavu_torch.places.layout import Layout
-from dejavu_torch.recognition.drive import localize_drive
-from dejavu_torch.recognition.localizer import Localizer, Matching, drive_query
+from dejavu_torch.recognition.drive import DriveQuery, localize_drive
+from dejavu_torch.recognition.localizer import Localizer, Matching
 
 SEEDS = (1, 2, 3)  # of whitening, queries, codebooks and the order of the control; settings were chosen on 0
 STRIDE, QUERIES = 4, 1500  # pixels of 12.5 cm; queries at any offset
@@ -104,7 +104,7 @@ def measured(seed: int) -> list[Row]:
         if key in FLOWN:
             smoother = PlaceSmoother(within=round(RADIUS / STRIDE))
             scorer = score(flown)
-            found = localize_drive(drive_query(scorer, smoother))
+            found = localize_drive(DriveQuery(scorer, smoother, radius=0, asks=False))
             right = (where.values[found.index[:, 0]] - own.values[path]).norm(dim=1) <= RADIUS
             sure = found.probability[:, 0] >= 0.5 if found.probability is not None else right
             matcher = Localizer(None, Matching(PlaceFilter()), layout=reference.layout)

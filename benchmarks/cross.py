@@ -341,8 +341,9 @@ def facts_of(board: Board, queries: Tensor, truth: GroundTruth | None = None) ->
     model, tolerance = board.model, board.tolerance
     moved, smoother = in_its_light(model, queries), PlaceSmoother(within=max(1, tolerance))
     drive = model.localize_descriptors(moved, model.matching(smoother)._replace(radius=tolerance))
-    found: dict[str, Any] = {"queries": len(queries), "taken": smoother.is_drive}
-    found |= {key: value for key, value in smoother.settled().items() if isinstance(value, float)}
+    assert drive.smoother is not None
+    found: dict[str, Any] = {"queries": len(queries), "taken": drive.is_drive}
+    found |= {key: value for key, value in drive.smoother.settled().items() if isinstance(value, float)}
     ways = {"drive": drive}
     within = {1: max(1, tolerance), 2: 0}[model.map.layout.dimensions]  # the truth has all windows of an area
     if model.calibration is not None:

@@ -194,15 +194,14 @@ def facts_of(known: Known, numbers: Tensor) -> dict[str, Any]:
     model, tolerance = known.model, known.tolerance
     queries, truth = asked(known, numbers)
     moved = in_its_light(model, queries)
-    smoother = PlaceSmoother(within=tolerance)
     single = model.matching()._replace(radius=tolerance)
-    together = model.matching(smoother)._replace(radius=tolerance)
+    together = model.matching(PlaceSmoother(within=tolerance))._replace(radius=tolerance)
     plain, one = (model.localize_descriptors(some, single) for some in (queries, moved))
     began = time.perf_counter()
     whole = model.localize_descriptors(moved, together)
     assert whole.probability is not None
     seconds = time.perf_counter() - began
-    found: dict[str, Any] = {"queries": len(queries), "is_drive": smoother.is_drive, "seconds": seconds}
+    found: dict[str, Any] = {"queries": len(queries), "is_drive": whole.is_drive, "seconds": seconds}
     found |= {"above_half": above(whole, 0.5), "above_nine_tenths": above(whole, 0.9)}
     found["one_above_half"] = None if one.probability is None else above(one, 0.5)
     probability, right = judged(whole, truth, tolerance)

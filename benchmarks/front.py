@@ -26,8 +26,8 @@ from dejavu_torch.evaluation.controls import shuffled, with_mapper
 from dejavu_torch.evaluation.curves import evaluate
 from dejavu_torch.evaluation.plots import Plot, legend, show_frame
 from dejavu_torch.places.layout import ROUTE
-from dejavu_torch.recognition.drive import localize_drives
-from dejavu_torch.recognition.localizer import drive_query, match_scores
+from dejavu_torch.recognition.drive import DriveQuery, localize_drives
+from dejavu_torch.recognition.localizer import answer
 
 ROAD = ("demo:road?traverse=0", "demo:road?traverse=1")
 OTHER = "sim:aerial?seed={seed}&size=96"  # another route, to learn codebooks on
@@ -99,11 +99,12 @@ def measured(seed: int) -> tuple[list[Row], Tensor, Tensor]:
     truth, rows = torch.arange(len(queries))[:, None], []
     ways = [*ways_of(model, places, other, seed)]
     driven = [way for way in ways if way.key not in ACCOUNTS]
-    asked = [drive_query(way.score(queries), PlaceSmoother(within=TOLERANCE)) for way in driven]
+    smoother = PlaceSmoother(within=TOLERANCE)
+    asked = [DriveQuery(way.score(queries), smoother, radius=0, asks=False) for way in driven]
     drives = dict(zip(map(id, driven), localize_drives(asked), strict=True))
     answers = hard = torch.empty(0)
     for way in ways:
-        single, drive = match_scores(way.score(queries)), drives.get(id(way))
+        single, drive = answer(way.score(queries)), drives.get(id(way))
         scores, right = evaluate(single, truth, TOLERANCE), is_right(single.index, truth, TOLERANCE)
         row = {"seed": seed, "contender": way.key, "bytes_per_place": way.room, "taken": way.bytes}
         row |= {"k": way.k, "with_codebooks": way.bytes + way.fixed / len(places), "auc": scores.auc}

@@ -17,7 +17,7 @@ from dejavu_torch.maps.spectral import SpectralMapper
 from dejavu_torch.maps.spectral_map import SpectralMap
 from dejavu_torch.recognition import drive as driving
 from dejavu_torch.recognition.large import is_large
-from dejavu_torch.recognition.localizer import Localizer, Matching
+from dejavu_torch.recognition.localizer import Matching, answer
 from dejavu_torch.recognition.scorer import OfMap
 from dejavu_torch.recognition.smoother import PlaceSmoother
 from dejavu_torch.types import Match
@@ -98,9 +98,7 @@ def measured(task: Task) -> dict[str, Any]:
 
     def whole() -> Match:
         smoother = PlaceSmoother(within=TOLERANCE)
-        return Localizer(place_map, Matching(smoother, radius=TOLERANCE)).drive(
-            OfMap(place_map, queries), smoother
-        )
+        return answer(OfMap(place_map, queries), Matching(smoother, radius=TOLERANCE))
 
     def recall(index: Tensor) -> float:
         return float(((index - truth[: len(index)]).abs() <= TOLERANCE).double().mean())

@@ -150,11 +150,12 @@ def bench_storage_drives(route: Asked) -> Iterator[Row]:
         queries = route.hog[1] if family == "HOG" and route.hog is not None else route.queries
         scores = phase_distances(queries, kept.descriptors, metric)
         for row in rows:
-            began, smoother = time.perf_counter(), PlaceSmoother(within=route.tolerance)
-            found = evaluate(answered(row["answer"], scores, queries, smoother), route.truth, route.tolerance)
+            began = time.perf_counter()
+            match = answered(row["answer"], scores, queries, PlaceSmoother(within=route.tolerance))
+            found = evaluate(match, route.truth, route.tolerance)
             seconds = time.perf_counter() - began
             auc = {"auc": found.auc, "recall_at_1": found.recall_at_1}
-            whole = smoother.is_drive if row["answer"] == "drive" else None
+            whole = match.is_drive if row["answer"] == "drive" else None
             yield row | size | auc | {"sequences": {"1": auc}, "is_drive": whole, "seconds": seconds}
 
 

@@ -23,8 +23,7 @@ from dejavu_torch.data.traverse import Part
 from dejavu_torch.evaluation.controls import shuffled
 from dejavu_torch.features.whitening import Whitening
 from dejavu_torch.places.layout import Layout
-from dejavu_torch.recognition.drive import localize_drive
-from dejavu_torch.recognition.localizer import drive_query
+from dejavu_torch.recognition.drive import DriveQuery, localize_drive
 
 SEEDS = (1, 2, 3)  # of ground, whitening and queries; settings were chosen on others
 SIZES = (0.3, 1.0, 2.2)  # bytes of the lines per place
@@ -89,7 +88,8 @@ def measured(seed: int, metres: int) -> list[Row]:
         single = torch.cat([asked_by.rows(part).argmin(1) for part in torch.arange(len(queries)).split(20)])
         found = found_within(single, area, where[asked])
         if size in FLOWN_AT or key == "uncompressed":
-            whole = localize_drive(drive_query(score(flown), PlaceSmoother())).index[:, 0]
+            drive = DriveQuery(score(flown), PlaceSmoother(), radius=0, asks=False)
+            whole = localize_drive(drive).index[:, 0]
             found += found_within(whole, area, where[path])
         row: Row = {"seed": seed, "contender": key, "bytes_per_place": size, "places": len(reference)}
         rows.append(row | dict(zip(FOUND, found, strict=False)))

@@ -34,7 +34,7 @@ from dejavu_torch.motion.resampling import ResampledTraverse, resampled, source_
 from dejavu_torch.places.layout import ROUTE, Layout
 from dejavu_torch.recognition.centring import PRIOR, centred, set_apart
 from dejavu_torch.recognition.coarse import searcher
-from dejavu_torch.recognition.localizer import Localizer, Matching
+from dejavu_torch.recognition.localizer import SINGLE, Localizer, Matching, answer
 from dejavu_torch.recognition.scorer import OfMap, Scorer
 from dejavu_torch.recognition.search import Scan, Search, Searcher, check_search
 from dejavu_torch.recognition.select import HIGHEST, PROBABLE, Acceptance, check_candidates
@@ -428,17 +428,12 @@ class DejaVu(nn.Module):
                 a shuffled map, whose match then counts frames.
         """
         matching = matching if isinstance(matching, Matching) else self.matching(matching)
-        localizer, smoother = self.localizer(matching), matching.sequence
-        plain = wrapped is None and matching.apart is None
-        if plain and not (smoother and smoother.whole):
-            match = localizer(descriptors, progress)
-            late = smoother is not None and smoother.lag
-            return Match.joined([match, localizer.finish()]) if late else match
-        scorer: Scorer = OfMap(self.map, descriptors)
-        scorer = scorer if wrapped is None else wrapped(scorer)
-        if isinstance(smoother, PlaceSmoother):
-            return localizer.drive(scorer, smoother, progress)
-        return localizer.match_all(scorer, progress)
+        scorer = self.scorer(descriptors, matching)
+        return answer(scorer if wrapped is None else wrapped(scorer), matching, progress)
+
+    def scorer(self, descriptors: Tensor, matching: Matching = SINGLE) -> Scorer:
+        """The scores of descriptors (Q,K) at the places of the map, to be matched so."""
+        return OfMap(self.map, descriptors, self._searcher(matching))
 
     def loops(self, traverse: Source, apart: int = 50, drive: bool = True, progress: bool = False) -> Match:
         """Where a drive comes back to places that it has passed before: the best earlier place of each frame.
@@ -468,12 +463,16 @@ class DejaVu(nn.Module):
     def loop_matching(self, apart: int, smoother: PlaceSmoother | None) -> Matching:
         """How `loops` matches. Answers are accepted as of single queries, or if a drive finds them likely."""
         single = self.matching(None)
-        likely = smoother is not None and not single.acceptance.given
-        acceptance = self.acceptance(smoother) if likely else single.acceptance
-        return single._replace(sequence=smoother, apart=apart, acceptance=acceptance)
+        drive = single if smoother is None else self.matching(smoother)
+        acceptance = single.acceptance if single.acceptance.given else drive.acceptance
+        return single._replace(sequence=drive.sequence, apart=apart, acceptance=acceptance)
 
     def localizer(self, matching: Matching) -> Localizer:
         """A matcher of descriptors, for consecutive batches of queries."""
+        return Localizer(self.map, matching, self._searcher(matching))
+
+    def _searcher(self, matching: Matching) -> Searcher | None:
+        """What finds the best places; None if all scores are needed. Refuses a way that is none of the map."""
         require_map(self)
         check_search(matching.search)
         if matching.sequence is not None:
@@ -481,11 +480,11 @@ class DejaVu(nn.Module):
             matching.sequence.check(None, self.map.places)
         single = matching.sequence is None and matching.callback is None
         if not single or matching.search not in ("auto", "coarse"):
-            return Localizer(self.map, matching)
+            return None
         searcher = self.searcher
         if searcher is None or (isinstance(searcher, Scan) and not searcher.fits(self.map)):
             self.searcher = searcher = self.make_searcher(self.map)
-        return Localizer(self.map, matching, searcher)
+        return searcher
 
     def matches(
         self,
@@ -575,13 +574,10 @@ class DejaVu(nn.Module):
             only = "calibrated for single queries and for a filter only"
             seen = f"the precision is {self.precision}, but the map is "
             raise InputError(f"{seen}{only if self.calibration else 'not calibrated'}; expected a threshold")
-        accepts = self.acceptance(sequence)
-        removed = REMOVED if self.descriptor.keeps_lengths else 1.0
-        ways = search or "auto"
-        single = self.calibration and self.calibration.single
-        return Matching(
-            sequence, acceptance=accepts, platt=platt, single=single, search=ways, removed=removed
-        )
+        if sequence is not None and self.descriptor.keeps_lengths:
+            sequence = sequence.having(removed=REMOVED)
+        accepts, single = self.acceptance(sequence), self.calibration and self.calibration.single
+        return Matching(sequence, acceptance=accepts, platt=platt, single=single, search=search or "auto")
 
     def acceptance(self, sequence: SequenceModel | None = None) -> Acceptance:
         """Which answers are accepted, for single queries or for a sequence (convention 4).

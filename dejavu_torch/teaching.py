@@ -40,12 +40,12 @@ SCORES_AT_ONCE = 2**22  # scores at a time
 def place_drive(model: DejaVu, descriptors: Tensor) -> Tensor:
     """The place of each frame of a drive, as sure as `SURE`, by the drive as a whole: (Q,K) -> (Q,) int64, -1
     for the others. All are -1 if it is no drive of the map, or too few of its frames are sure."""
-    smoother, queries = PlaceSmoother(), in_its_light(model, descriptors)
-    match = model.localize_descriptors(queries, model.matching(smoother))
+    queries = in_its_light(model, descriptors)
+    match = model.localize_descriptors(queries, model.matching(PlaceSmoother()))
     assert match.probability is not None
     places = torch.where(match.probability >= SURE, match.index, -1)
     few = int((places >= 0).sum()) < max(FEWEST, SHARE * len(places))
-    return torch.full_like(places, -1) if few or not smoother.is_drive else places
+    return torch.full_like(places, -1) if few or not match.is_drive else places
 
 
 def place_drives(
@@ -214,13 +214,12 @@ def _calibration(
     place_map: PlaceMap, queries: Tensor, places: Tensor, scores: Iterator[Tensor]
 ) -> Calibration:
     """The calibration by the scores of all queries of a drive, which the smoother has centred."""
-    smoother, layout = PlaceSmoother(), place_map.layout
-    smoother.map_links = place_map.connections
+    layout = place_map.layout
 
     def rows(numbers: Tensor) -> Tensor:
         return place_map.scores(queries[numbers])
 
-    smoother.fit(rows, queries, layout.starts)
+    smoother = PlaceSmoother(links=place_map.connections).fit(rows, queries, layout.starts)
     return calibrated_by_drive(scores, places, smoother, smoother.drive(rows, queries), layout)
 
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from functools import cached_property
 from itertools import pairwise
-from typing import Any, Literal, NamedTuple, SupportsIndex, TypeAlias
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, SupportsIndex, TypeAlias
 
 import torch
 from torch import Tensor, nn
@@ -22,6 +22,9 @@ from dejavu_torch.places.layout import ROUTE, Layout
 from dejavu_torch.text import InputError as InputError
 from dejavu_torch.text import expect as expect
 from dejavu_torch.text import printable
+
+if TYPE_CHECKING:
+    from dejavu_torch.recognition.smoother import PlaceSmoother
 
 BATCH_NUMBERS = 2**26  # values in a batch of more than one frame: 256 MB
 BATCH_SIZE = 64  # frames read at a time by default
@@ -266,6 +269,8 @@ class Match:
             a place; None unless several headings were tried.
         sequences: by T, matches (Q,) of the same queries in sequences, a filter or a smoother, for reports;
             mostly empty.
+        smoother: of a whole drive, the `PlaceSmoother` as it was fitted to the queries, which tells whether
+            they are a drive of the map; else None.
     """
 
     index: Tensor
@@ -276,11 +281,17 @@ class Match:
     confidence: Tensor | None = None
     heading: Tensor | None = None
     sequences: Mapping[Together, Match] = field(default_factory=dict)
+    smoother: PlaceSmoother | None = None
 
     @property
     def columns(self) -> dict[str, Tensor]:
         """Those of the seven columns that are known, by name."""
         return {name: column for name, column in vars(self).items() if isinstance(column, Tensor)}
+
+    @property
+    def is_drive(self) -> bool:
+        """Whether the queries are a drive of the map, as a smoother finds; False without one."""
+        return self.smoother is not None and self.smoother.is_drive
 
     def __iter__(self) -> Iterator[Tensor]:
         return iter((self.index, self.score, self.accepted))
@@ -308,8 +319,8 @@ class Match:
 
     def map(self, change: Callable[[Tensor], Tensor]) -> Match:
         """The same change in every column, but not in `sequences`."""
-        columns = {name: change(column) for name, column in self.columns.items()}
-        return Match(**columns, sequences=self.sequences)
+        columns: dict[str, Any] = {name: change(column) for name, column in self.columns.items()}
+        return replace(self, **columns)
 
     def renumbered(self, place: Callable[[Tensor], Tensor]) -> Match:
         """The match with `place` applied to its places, in `sequences` too; it must keep -1."""
@@ -324,7 +335,7 @@ class Match:
         names = [name for name in columns[0] if all(name in part for part in columns)]
         whole = {name: torch.cat([part[name] for part in columns]) for name in names}
         sequences = {T: Match.joined(part.sequences[T] for part in parts) for T in parts[0].sequences}
-        return Match(**whole, sequences=sequences)
+        return Match(**whole, sequences=sequences, smoother=parts[0].smoother)
 
 
 class Training(NamedTuple):
@@ -347,7 +358,8 @@ class SequenceModel(nn.Module, ABC):
             than these five.
 
     Convention: each score is for the place of its own query. All but those of a `whole` drive are causal, and
-        their memory does not grow with the queries.
+        their memory does not grow with the queries. Matching changes none: what it has to know beside its
+        settings is a state, or a copy, see `changed`.
     """
 
     likely: float | None = None
@@ -383,11 +395,19 @@ class SequenceModel(nn.Module, ABC):
         layout.expect_route(expected, f"{type(self).__name__}, and the map of an area")
         return self
 
-    def reaching(self, within: int) -> Self:
-        """A copy that sums up probabilities within so many places, if it has such a number, `within`."""
-        copied = copy.deepcopy(self)
-        copied.__dict__.update({"within": within} if "within" in self.__dict__ else {})
-        return copied
+    def changed(self, **attributes: object) -> Self:
+        """A copy with other attributes, which shares all parameters and buffers but those that are given."""
+        other = copy.copy(self)
+        for kind in ("_parameters", "_buffers", "_modules"):
+            other.__dict__[kind] = {**self.__dict__[kind]}
+        for name, value in attributes.items():
+            setattr(other, name, value)
+        return other
+
+    def having(self, **settings: object) -> Self:
+        """A copy with those of these settings that it has, such as `within`, up to how many places away
+        probabilities are added up."""
+        return self.changed(**{name: value for name, value in settings.items() if name in self.__dict__})
 
     def finish(self, state: Tensor, route_starts: Sequence[int] = (0,)) -> tuple[Tensor, Tensor]:
         """The answers that wait for later queries, at the end of all: -> scores (B,N), the next state."""

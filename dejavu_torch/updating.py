@@ -105,9 +105,9 @@ def update(
         ['map', 'monday']
     """
     traverse, descriptors = described(model, drive, "update", progress)
-    answers, smoother = _answered(model.map, in_its_light(model, descriptors), [], progress)
+    answers = _answered(model.map, in_its_light(model, descriptors), [], progress)
     sure = (answers.match.probability[:, 0] >= SURE).sum()  # type: ignore[index]
-    if not smoother.is_drive or int(sure) < max(NEWEST, SHARE * len(descriptors)):
+    if not answers.match.is_drive or int(sure) < max(NEWEST, SHARE * len(descriptors)):
         return Update(None, False)
     refined = refined_by(model, descriptors) if len(descriptors) >= FEWEST else None
     refinement = refined and refined.told
@@ -144,8 +144,8 @@ def _new_ground(place_map: SpectralMap, queries: Tensor, progress: bool) -> NewG
         grown = place_map
         for i, (first, last) in enumerate(new):
             grown = grown.with_route(f"new {i}", _coded(place_map, queries[first:last]), "map")
-        answers, smoother = _answered(grown, queries, new, progress)
-        unknown = _runs(answers.absent, new, least) if smoother.is_drive else []
+        answers = _answered(grown, queries, new, progress)
+        unknown = _runs(answers.absent, new, least) if answers.match.is_drive else []
         told = bool(unknown) and _recognised(grown, queries, answers.match)
         found = [stretch for stretch in unknown if told or _at_an_end(grown, answers.match, stretch)]
         if not found:
@@ -211,14 +211,10 @@ class Silent(Wrapped):
         return torch.where(self.silent[queries, None].to(scores.device), 0, scores)
 
 
-def _answered(
-    place_map: PlaceMap, queries: Tensor, stored: Sequence[Stretch], progress: bool
-) -> tuple[Answers, PlaceSmoother]:
+def _answered(place_map: PlaceMap, queries: Tensor, stored: Sequence[Stretch], progress: bool) -> Answers:
     """What a smoother tells of queries (Q,K), of which those that are stored say nothing."""
-    scorer, smoother = Silent(OfMap(place_map, queries), stored), PlaceSmoother()
-    smoother.map_links = scorer.links
-    (answers,) = answer_drives([DriveQuery(scorer, smoother)], progress)
-    return answers, smoother
+    scorer = Silent(OfMap(place_map, queries), stored)
+    return answer_drives([DriveQuery(scorer, PlaceSmoother())], progress)[0]
 
 
 def _joins(answers: Answers, stretch: Stretch, grown: SpectralMap) -> tuple[list[Link], bool]:

@@ -379,23 +379,20 @@ def test_a_flight_is_found_where_single_images_are_not():
     def near(match):
         return float((area.distance(match.index.clamp(min=0), truth) <= 2).double().mean())
 
-    one, smoother = model.localize_descriptors(queries), PlaceSmoother()
-    whole = model.localize_descriptors(queries, smoother)
-    assert smoother.is_drive
+    one, whole = (model.localize_descriptors(queries, way) for way in (None, PlaceSmoother()))
+    assert whole.is_drive
     assert near(whole) > near(one) + 0.1
     assert near(whole) > 0.85
     right = area.distance(whole.index.clamp(min=0), truth) <= 5
     assert float(whole.probability.mean()) == pytest.approx(float(right.double().mean()), abs=0.1)
-    mixed = PlaceSmoother()
-    model.localize_descriptors(queries[torch.randperm(90, generator=draw)], mixed)
+    mixed = model.localize_descriptors(queries[torch.randperm(90, generator=draw)], PlaceSmoother())
     assert not mixed.is_drive  # in no order
-    elsewhere, away = smooth(30, 40, seed=9), PlaceSmoother()
-    model.localize_descriptors(elsewhere[truth], away)
+    away = model.localize_descriptors(smooth(30, 40, seed=9)[truth], PlaceSmoother())
     assert not away.is_drive  # over other ground
-    noise, unsure = torch.randn(90, own.shape[1], generator=draw), PlaceSmoother()
+    noise = torch.randn(90, own.shape[1], generator=draw)
     bare = lambda scorer: OfRows(scorer.rows, scorer.descriptors, area)  # noqa: E731 whose images are not asked
-    model.localize_descriptors(own[truth] + 0.8 * noise, unsure, bare)
-    assert 0.05 < unsure.nats_per_query < 0.2
+    unsure = model.localize_descriptors(own[truth] + 0.8 * noise, PlaceSmoother(), bare)
+    assert 0.05 < unsure.smoother.nats_per_query < 0.2
     assert not unsure.is_drive  # by too little for each image
 
 

@@ -22,7 +22,8 @@ from dejavu_torch.data.turning import Turned, facing_north, turned_north
 from dejavu_torch.maps.spectral_map import SpectralMap
 from dejavu_torch.places.layout import Layout
 from dejavu_torch.recognition.centring import learn_turned, set_apart
-from dejavu_torch.recognition.localizer import Localizer, Matching
+from dejavu_torch.recognition.localizer import Matching, answer
+from dejavu_torch.recognition.scorer import OfRows
 from dejavu_torch.recognition.select import best_candidates
 
 
@@ -84,7 +85,9 @@ def test_the_best_of_all_copies_is_the_minimum_of_their_scores(model, images):
         assert torch.allclose(match.score, expected.score, atol=1e-4)
         at = expected.index[:, None].expand(-1, 4, -1)
         assert torch.equal(match.heading, 90.0 * scores.gather(2, at).argmin(1))
-    none = Localizer(None, Matching(copies=2)).match(torch.full((2, 5), math.inf))
+    none = answer(
+        OfRows(lambda numbers: torch.full((2, 5), math.inf), rows[:2], Layout(5)), Matching(copies=2)
+    )
     assert none.index.tolist() == [-1]
     assert none.heading.isnan().all()
 

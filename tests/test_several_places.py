@@ -31,7 +31,7 @@ def model():
 def test_the_first_candidate_is_what_localize_finds(monkeypatch, model):
     queries = torch.rand(40, 6, generator=torch.Generator().manual_seed(1))
     index, score, _ = model.candidates(queries, 5, apart=3)
-    monkeypatch.setattr("dejavu_torch.recognition.localizer.SCORES_AT_ONCE", 200)
+    monkeypatch.setattr("dejavu_torch.recognition.scorer.Scorer.at_once", 200)
     match = model.localize(queries)
     found = model.candidates(ArrayTraverse(queries), 5, apart=3)
     assert torch.equal(found.index, index)

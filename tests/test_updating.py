@@ -162,13 +162,15 @@ def test_connections_are_followed_by_a_whole_drive():
     update(model, seen(torch.cat([ROUTE[40:120], ASIDE, ROUTE[120:200]])))
     assert len(model.map.connections) == 2
     drive = seen(torch.cat([ROUTE[60:120], ASIDE, ROUTE[120:180]]), seed=6)
-    with_links, without = PlaceSmoother(), PlaceSmoother()
-    match = model.localize_descriptors(drive, model.matching(with_links))
-    assert with_links.map_links == model.map.connections
+    match = model.localize_descriptors(drive, PlaceSmoother())
+    assert match.smoother is not None
+    ((end, start, _), (last, back, _)) = match.smoother.map_links
+    assert match.smoother.map_links == model.map.connections
     model.replace_map(spectral(model).linked([]))
-    model.localize_descriptors(drive, model.matching(without))
-    assert with_links.log_likelihood > without.log_likelihood + 5  # type: ignore[operator]
-    ((end, start, _), (last, back, _)) = with_links.map_links
+    without = model.localize_descriptors(drive, match.smoother).smoother  # which learns anew
+    assert without is not None
+    assert without.map_links == ()
+    assert match.smoother.log_likelihood > without.log_likelihood + 5  # type: ignore[operator]
     expected = [*range(60, end + 1), *range(start, last + 1), *range(back, 180)]
     assert ((match.index[:60] - torch.tensor(expected[:60])).abs() <= 5).all()
 

@@ -107,11 +107,12 @@ def run_localize(
         matches = model.matches(query, True, matcher, None, top, SUPPRESSION, centre, headings)
     if top is not None:
         matches = (part.map(Tensor.flatten) for part in matches)
-    counts: Counter[str] = Counter()
+    counts, lost = Counter[str](), set[bool]()
 
     def counted() -> Iterator[Match]:
         for match in matches:
             counts.update(probable_counts(match))
+            lost.add(match.smoother is not None and not match.is_drive)
             yield match
 
     with ExitStack() as stack:
@@ -125,7 +126,7 @@ def run_localize(
         print("the map has no layers, so no place can be reported")
     elif not chosen.given:
         print(chosen)
-    if isinstance(matcher, PlaceSmoother) and not matcher.is_drive:
+    if loops is None and any(lost):
         print(NO_DRIVE)
     if damaged:
         one, many = min(damaged), len(damaged)

@@ -371,7 +371,7 @@ def _unused_folder() -> Path:
 
 def _print_run(run: Localization) -> None:
     """Print the map of a run, and what it accepts."""
-    acceptance = run.model.acceptance(run.smoother or run.sequence)
+    acceptance = run.model.acceptance(run.way)
     print_map(run.model)
     if run.truth is None:
         print("no ground truth (see --truth): matches and pictures, but no scores")

@@ -28,7 +28,7 @@ from dejavu_torch.model_file import recipe_of
 from dejavu_torch.motion.resampling import ResampledTraverse
 from dejavu_torch.places.layout import ROUTE, Layout
 from dejavu_torch.recognition.drive import DriveQuery, localize_drives
-from dejavu_torch.recognition.localizer import SINGLE, Matching, drive_query, match_scores
+from dejavu_torch.recognition.localizer import SINGLE, Matching, answer
 from dejavu_torch.recognition.scorer import OfMap, OfStored, Reordered, Scorer
 from dejavu_torch.recognition.smoother import PlaceSmoother
 from dejavu_torch.types import InputError, Match, Traverse
@@ -48,7 +48,7 @@ class Baseline(NamedTuple):
 
     name: for tables. scorer: of the same queries. bytes: in all. k: the stride, if every k-th frame is
     stored. fixed: the part of the bytes that does not grow with the route, such as a backbone. found: the
-    matches, if they are known. asks: see `DriveQuery`. removed: see `PlaceSmoother`; None as of the run.
+    matches, if they are known.
     """
 
     name: str
@@ -57,15 +57,13 @@ class Baseline(NamedTuple):
     k: int | None = None
     fixed: int = 0
     found: Match | None = None
-    asks: bool = False
-    removed: float | None = None
 
     def match(self, matching: Matching = SINGLE, progress: bool = False) -> Match:
         """The matches of its scores, unless they are known."""
         if self.found is not None:
             return self.found
         assert self.scorer is not None
-        return replace(match_scores(self.scorer, matching, progress, "baselines"), probability=None)
+        return replace(answer(self.scorer, matching, progress, "baselines"), probability=None)
 
 
 def matched(
@@ -84,7 +82,7 @@ def matched(
     for key, one in baselines:
         found[key] = one._replace(scorer=None), one.match(matching, progress)
         if one.scorer is not None and smoother is not None and (driven is None or key in driven):
-            asked[key] = drive_query(one.scorer, smoother, one.asks, one.removed)
+            asked[key] = DriveQuery(one.scorer, smoother, radius=0, asks=False)
         del one  # its descriptors, before those of the next
     for key, drive in zip(asked, localize_drives([*asked.values()], progress), strict=True):
         (one, match), best = found[key], drive.map(lambda column: column[:, 0])
@@ -113,7 +111,7 @@ def nearest_frames(
         Match of (Q,). Single queries find stored frames only, sequences also frames between these.
     """
     scorer = OfStored(reference, query, k, metric, layout)
-    return replace(match_scores(scorer, matching, progress, "baselines"), probability=None)
+    return replace(answer(scorer, matching, progress, "baselines"), probability=None)
 
 
 def stored_frames(frames: int, k: int, layout: Layout = ROUTE) -> tuple[Tensor, Tensor]:

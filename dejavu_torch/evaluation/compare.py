@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import logging
 import math
 import time
@@ -50,7 +49,7 @@ from dejavu_torch.places.layout import Layout, Reach
 from dejavu_torch.recognition.calibration import TOLERANCE
 from dejavu_torch.recognition.centring import centred, set_apart
 from dejavu_torch.recognition.localizer import Matching
-from dejavu_torch.recognition.scorer import OfMap, Scorer
+from dejavu_torch.recognition.scorer import Scorer
 from dejavu_torch.recognition.select import check_candidates
 from dejavu_torch.recognition.smoother import PlaceSmoother
 from dejavu_torch.types import InputError, Match, SequenceModel, Together, Traverse, expect
@@ -196,9 +195,8 @@ def compare(
             known = ground_truth_in_places(known, model.map.place_of)
             known = of_loops(known, torch.arange(len(query)), loops) if loops is not None else known
         reach = reach_of(within, known, near is not None or radius > 0)
-        # the caller keeps his own
-        smoother = None if smoother is None else smoother.reaching(reach)
-        causal = None if causal is None else causal.reaching(reach)
+        smoother = smoother and smoother.having(within=reach)
+        causal = causal and causal.having(within=reach)
         with _calibrated(model, reach, reference, calibration, progress):
             with timed(seconds, "localize"):
                 # without truth they have no scores
@@ -477,14 +475,14 @@ def _smoothed(
     own = own._replace(copies=run.matching.copies)
     drive = model.localize_descriptors(run.query_features, own, progress=progress)
     best = drive.map(lambda column: column[:, 0])
+    assert drive.smoother is not None
     if apart is None:
         judged = replace(run.judged, sequences={**run.judged.sequences, "smoother": best})
-        if beside is not None:
-            beside.removed = own.removed
+        beside = beside and beside.having(removed=drive.smoother.removed)
         run = run._replace(judged=judged, beside=beside)
     if smoother is None:
         return run, found
-    return run._replace(match=best, smoother=smoother), drive
+    return run._replace(match=best), drive
 
 
 def _other_contenders(
@@ -509,8 +507,10 @@ def _other_contenders(
             other.learn(run.reference, progress)
             queries, size = run.described_by(other, progress), other.summary()
             match = other.localize_descriptors(queries, run.matching, progress=progress)
-            sizes, removed = (size.map_bytes, None, size.fixed_bytes), other.matching(PlaceSmoother()).removed
-            yield key, Baseline(name, OfMap(other.map, queries), *sizes, match, True, removed)
+            if run.beside is not None and drives:
+                drive = other.localize_descriptors(queries, other.matching(run.beside), progress=progress)
+                match = replace(match, sequences={**match.sequences, "smoother": drive})
+            yield key, Baseline(name, None, size.map_bytes, None, size.fixed_bytes, match)
 
     contenders = {}
     found = matched(further(), run.matching, run.beside, None if drives else DRIVEN, progress)
@@ -556,7 +556,7 @@ def _match_distractors(
     for other in distractors:
         asked = facing_north(other, model.map.layout, headings)
         queries = model.descriptor.all_of(asked, progress)
-        matching = model.matching(copy.deepcopy(whole) if whole else sequence)._replace(copies=headings)
+        matching = model.matching(sequence)._replace(copies=headings)
         if isinstance(asked, Turned):
             queries = set_apart(model.map, queries)
         elif centring and (sequence is None or whole):

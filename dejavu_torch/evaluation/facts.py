@@ -56,7 +56,8 @@ def _map_facts(summary: MapSummary, features: Tensor) -> Facts:
 def _run_facts(run: Localization, seconds: Mapping[str, float]) -> Facts:
     """The entries of report.json about the run; no seconds to learn if the map is given."""
     model, reference, query = run.model, run.reference, run.query
-    acceptance, way = model.acceptance(run.smoother or run.sequence), run.sequence
+    way, smoother = run.sequence, run.match.smoother
+    acceptance = model.acceptance(run.way)
     facts = {
         "answers": run.answers,
         "seconds_learn": seconds["learn"],
@@ -75,10 +76,10 @@ def _run_facts(run: Localization, seconds: Mapping[str, float]) -> Facts:
         **peak_memory(),
         **_gap_facts(run),
     }
-    if run.smoother is not None:
-        facts["drive"] = drive = run.smoother.settled()
+    if smoother is not None:
+        facts["drive"] = drive = smoother.settled()
         if run.truth is not None:
-            block = math.ceil(run.smoother.correlation)
+            block = math.ceil(smoother.correlation)
             drive["auc_error"] = auc_error(run.scored, run.truth, run.tolerance, block)
     if run.matching.apart is not None:
         facts["loops"] = run.matching.apart
@@ -142,7 +143,7 @@ def metric_facts(run: Localization, truth: Truth | None) -> Facts:
 def _gap_facts(run: Localization) -> Facts:
     """Of queries in order: the longest stretch without an accepted answer, in frames and, if known, seconds
     from the answer before to that after."""
-    in_order = run.query.ordered or run.smoother is not None or run.sequence is not None
+    in_order = run.query.ordered or run.match.smoother is not None or run.sequence is not None
     if not in_order or run.matching.apart is not None:
         return {}
     ends, count = (run.match.accepted & (run.match.index >= 0)).nonzero()[:, 0].tolist(), len(run.match.index)

@@ -30,9 +30,9 @@ class Localization(NamedTuple):
     truth: None if unknown. tolerance: in places, inclusive. matching: for the map and all baselines.
     causal_features: the queries for sequences and filters, if query_features are centred, which takes all
     of them. match: the answers. judged: the matches that the scores at top level judge, with those of
-    other models. smoother: of the answers, if they are those of the whole drive. beside: one to compare
-    all contenders by, if any. radius: over an area, the distance within which a match is right, in the unit
-    of its coordinates; tolerance is 0. Along a route the tolerance once more.
+    other models. beside: a smoother to compare all contenders by, if any. radius: over an area, the distance
+    within which a match is right, in the unit of its coordinates; tolerance is 0. Along a route the tolerance
+    once more.
 
     Convention 11: match and truth count places and queries, pictures show frames of the sources.
     """
@@ -48,7 +48,6 @@ class Localization(NamedTuple):
     matching: Matching = SINGLE
     causal_features: Tensor | None = None
     judged: Match = NOTHING
-    smoother: PlaceSmoother | None = None
     beside: PlaceSmoother | None = None
     radius: float = 0.0
 
@@ -59,6 +58,11 @@ class Localization(NamedTuple):
     def sequence(self) -> SequenceModel | None:
         """The model that scores consecutive queries together, if any."""
         return self.matching.sequence
+
+    @property
+    def way(self) -> SequenceModel | None:
+        """How the answers were found; None of single images."""
+        return self.match.smoother or self.sequence
 
     @property
     def asked(self) -> Traverse:
@@ -85,8 +89,8 @@ class Localization(NamedTuple):
         """How the answers were found: loops, drive, filter, sequence or single."""
         if self.matching.apart is not None:
             return "loops"
-        if self.smoother is not None:
-            return "drive" if self.smoother.is_drive else "single"
+        if self.match.smoother is not None:
+            return "drive" if self.match.is_drive else "single"
         return "single" if self.sequence is None else self.sequence.answers
 
     @property

@@ -50,7 +50,7 @@ class Shown(NamedTuple):
 
 
 class DriveQuery(NamedTuple):
-    """A drive to match by a smoother, which is fitted to it.
+    """A drive to match by a smoother, a copy of which is fitted to it.
 
     Attributes:
         scorer: of all queries. k: candidates. radius: suppression radius in places.
@@ -70,21 +70,21 @@ class DriveQuery(NamedTuple):
 
     @property
     def answers(self) -> bool:
-        """Whether the drive answers, once the smoother is fitted."""
+        """Whether the drive answers, by a fitted smoother."""
         return self.smoother.is_drive and not self.checks
 
-    def ask_singly(self, spacing: Spacing) -> None:
-        """Leave to the smoother only what single images find as well."""
-        few, scorer, known = float(spacing.weight.sum()) < FEW, self.scorer, self.smoother
-        least = scorer.least if self.asks else 0.0
-        known.is_drive &= known.nats_per_query >= (max(least, ALONE) if few else least)
+    def fitted(self, smoother: PlaceSmoother, spacing: Spacing) -> DriveQuery:
+        """The same by a fitted smoother, to which is left only what single images find as well."""
+        few, scorer = float(spacing.weight.sum()) < FEW, self.scorer
+        least, found = scorer.least if self.asks else 0.0, None
+        is_drive = smoother.is_drive and smoother.nats_per_query >= (max(least, ALONE) if few else least)
         if self.asks and scorer.null is not None and not few:
             layout, apart = scorer.layout, self.radius
             sure = lambda scores: confidence(best_pair(scores, layout, apart=apart))  # noqa: E731
             found = singly(scorer.rows, scorer.null, spacing.weight.cpu(), sure)
-            least = SURER[layout.dimensions]
-            known.singly = found._replace(nats=known.nats_per_query, least=least)
-            known.is_drive &= known.singly.stands_out
+            found = found._replace(nats=smoother.nats_per_query, least=SURER[layout.dimensions])
+            is_drive &= found.stands_out
+        return self._replace(smoother=smoother.changed(is_drive=is_drive, singly=found))
 
 
 class Seen(NamedTuple):
@@ -100,7 +100,8 @@ class Seen(NamedTuple):
 
 
 class Answers(NamedTuple):
-    """The matches (Q,k) of a drive, and the probability that each query is off the map, (Q,)."""
+    """The matches (Q,k) of a drive, with its smoother, and the probability that each query is off the map,
+    (Q,)."""
 
     match: Match
     absent: Tensor
@@ -130,6 +131,7 @@ def answer_drives(drives: Sequence[DriveQuery], progress: bool = False) -> list[
         on the CPU.
     """
     shown: list[list[Shown]] = [[] for _ in drives]
+    fitted = [*drives]
     several = len(drives) > 1  # of which each takes about as long
     scorers = [asked.scorer for asked in drives]
     count = len(drives) if several else sum(map(len, scorers))
@@ -137,10 +139,10 @@ def answer_drives(drives: Sequence[DriveQuery], progress: bool = False) -> list[
     one_thread = in_one_thread(math.inf if large else 2 * sum(one.layout.places for one in scorers))
     unit = "drive" if several else "query"
     with one_thread, progress_of("smoothing", count, progress, unit) as update:
-        for i, seen in _seen(drives, progress, update if several else lambda _: None):
-            shown[i].append(_shown(drives[i], seen))
+        for i, fitted[i], seen in _seen(drives, progress, update if several else lambda _: None):
+            shown[i].append(_shown(fitted[i], seen))
             update(0 if several else len(seen.scores))
-    return [_joined(asked, parts[::-1]) for asked, parts in zip(drives, shown, strict=True)]
+    return [_joined(asked, parts[::-1]) for asked, parts in zip(fitted, shown, strict=True)]
 
 
 def _shown(asked: DriveQuery, seen: Seen) -> Shown:
@@ -176,7 +178,8 @@ def _joined(asked: DriveQuery, parts: list[Shown]) -> Answers:
     k = asked.k
     if not parts:
         empty = torch.zeros(0, k)
-        match = Match(empty.long(), empty, empty.bool(), empty.double(), confidence=empty)
+        smoother = asked.smoother.forgetful()
+        match = Match(empty.long(), empty, empty.bool(), empty.double(), confidence=empty, smoother=smoother)
         return Answers(match, torch.zeros(0).double())
     match = Match.joined(part.match for part in parts)
     absent, sure, probability, own = (torch.cat(column) for column in [*zip(*parts, strict=True)][1:])
@@ -185,66 +188,67 @@ def _joined(asked: DriveQuery, parts: list[Shown]) -> Answers:
         match, sure = replace(match, score=match.score + doubts[:, None]), sure - doubts
     match = replace(match, score=match.score.to(own.dtype))
     confidences = first_of(sure.to(own.dtype), k)
-    return Answers(replace(match, probability=first_of(probability, k), confidence=confidences), absent)
+    match = replace(match, probability=first_of(probability, k), confidence=confidences)
+    return Answers(replace(match, smoother=asked.smoother), absent)
 
 
 def _seen(
     drives: Sequence[DriveQuery], progress: bool, fitted_one: Callable[[int], object]
-) -> Iterator[tuple[int, Seen]]:
-    """Fit the smoothers to drives; then the numbers of the drives with what is seen.
+) -> Iterator[tuple[int, DriveQuery, Seen]]:
+    """The numbers of drives, with smoothers that are fitted to them and what these see.
 
     fitted_one: called with 1 for each drive, when its smoother is fitted.
     """
     spacings: dict[int, Spacing] = {}  # of descriptors that several drives share
-    fitted: dict[tuple[int, States, int], list[tuple[int, Drive]]] = {}
+    fitted: dict[tuple[int, States, int], list[tuple[int, DriveQuery, Drive]]] = {}
     for i, asked in enumerate(drives):
-        scorer, smoother = asked.scorer, asked.smoother
+        scorer, smoother = asked.scorer, asked.smoother.changed(map_links=asked.scorer.links)
+        asked = asked._replace(smoother=smoother)
         descriptors, layout = scorer.descriptors, scorer.layout
         along = _of_windows if is_large(len(scorer), layout.places) else None
         if alone := {1: along, 2: _of_flight}[layout.dimensions]:
             fitted_one(1)
-            yield from ((i, seen) for seen in alone(asked, progress))
+            yield from ((i, known, seen) for known, seen in alone(asked, progress))
             continue
         spacing = spacings.get(id(descriptors))
         spacing = spacings[id(descriptors)] = spacing_of(descriptors) if spacing is None else spacing
-        smoother.fit(scorer.rows, descriptors, layout.starts, spacing)
-        asked.ask_singly(spacing)
+        asked = asked.fitted(smoother.fit(scorer.rows, descriptors, layout.starts, spacing), spacing)
+        smoother = asked.smoother
         fitted_one(1)
         kind = len(scorer), smoother.states(layout.places, layout.starts), len(smoother.move_logits)
-        fitted.setdefault(kind, []).append((i, smoother.drive(scorer.rows, descriptors, spacing)))
+        fitted.setdefault(kind, []).append((i, asked, smoother.drive(scorer.rows, descriptors, spacing)))
     for (queries, states, _), alike in fitted.items():
         every = len(alike) * queries * states.places <= SCORES_KEPT
-        alike = [(i, drive._replace(rows=_kept(drive.rows, every))) for i, drive in alike]
-        pairs = [(drives[i].smoother, drive) for i, drive in alike]
+        alike = [(i, asked, drive._replace(rows=_kept(drive.rows, every))) for i, asked, drive in alike]
+        pairs = [(asked.smoother, drive) for _, asked, drive in alike]
         for block in blocks_together(pairs, drives[alike[0][0]].scorer.layout.starts):
             numbers = torch.arange(block.first, block.first + block.log.shape[-1])
-            for (i, drive), posterior in zip(alike, block.posterior, strict=True):
-                asked = drives[i]
-                yield i, Seen(_mass(posterior), drive.rows(numbers).cpu())
+            for (i, asked, drive), posterior in zip(alike, block.posterior, strict=True):
+                yield i, asked, Seen(_mass(posterior), drive.rows(numbers).cpu())
 
 
-def _of_flight(asked: DriveQuery, progress: bool) -> Iterator[Seen]:
+def _of_flight(asked: DriveQuery, progress: bool) -> Iterator[tuple[DriveQuery, Seen]]:
     """What is seen of a drive over an area."""
     scorer = asked.scorer
     spacing, queries = spacing_of(check_descriptors(scorer.descriptors)), len(scorer)
-    mass = place_flight(asked.smoother, scorer.rows, queries, scorer.layout, spacing)
-    asked.ask_singly(spacing)
-    yield Seen(mass.double(), scorer.rows(torch.arange(queries)).cpu())
+    mass, smoother = place_flight(asked.smoother, scorer.rows, queries, scorer.layout, spacing)
+    seen = Seen(mass.double(), scorer.rows(torch.arange(queries)).cpu())
+    yield asked.fitted(smoother, spacing), seen
 
 
-def _of_windows(asked: DriveQuery, progress: bool) -> Iterator[Seen]:
+def _of_windows(asked: DriveQuery, progress: bool) -> Iterator[tuple[DriveQuery, Seen]]:
     """What is seen of a drive on a large map."""
     scorer, places = asked.scorer, asked.scorer.layout.places
     drive = LargeDrive(scorer, asked.smoother, max(2, asked.k), asked.radius, progress)
-    asked.ask_singly(drive.spacing)
+    asked = asked.fitted(drive.smoother, drive.spacing)
     for first, posterior, scores, known in drive:
         mass = _mass(posterior)
         if asked.answers:
-            yield Seen(mass, scores, known)
+            yield asked, Seen(mass, scores, known)
             continue
         for part in reversed(torch.arange(len(mass)).split(max(1, TILE // places))):
             whole = mass.new_zeros(len(part), places).index_copy(1, known, mass[part])
-            yield Seen(whole, scorer.rows(first + part).cpu())
+            yield asked, Seen(whole, scorer.rows(first + part).cpu())
 
 
 def _kept(rows: Rows, every: bool) -> Rows:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
@@ -123,21 +122,19 @@ class PlaceFilter(SequenceModel):
         self.log_sharpness = nn.Parameter(torch.tensor(float(sharpness), dtype=torch.float32).log())
         self.off_map = nn.Parameter(torch.tensor(float(off_map), dtype=torch.float32))
         self.within, self.threshold, self.lag, self.learns = within, threshold, lag, learns
-        self.layout = ROUTE  # of the places, which a `Localizer` sets
+        self.layout = ROUTE  # of the places, see `over`
 
     def over(self, layout: Layout) -> Self:
         """A copy for places that lie so; moves and sharpness for an area replace those for a route by
         default."""
-        copied = copy.deepcopy(self)
-        copied.layout = layout
         before, after = MOVES[self.layout.dimensions], MOVES[layout.dimensions]
-        if before == after:
-            return copied
-        if torch.equal(self.move_logits.cpu().float(), logits(*before)):
-            copied.move_logits = nn.Parameter(logits(*after).to(self.off_map))
-        if float(self.log_sharpness.detach().exp()) == SHARPNESS[self.layout.dimensions]:
-            copied.log_sharpness.data.fill_(math.log(SHARPNESS[layout.dimensions]))
-        return copied
+        moves, sharpness = self.move_logits, self.log_sharpness
+        if before != after and torch.equal(moves.cpu().float(), logits(*before)):
+            moves = nn.Parameter(logits(*after).to(self.off_map))
+        if before != after and float(sharpness.detach().exp()) == SHARPNESS[self.layout.dimensions]:
+            own = math.log(SHARPNESS[layout.dimensions])
+            sharpness = nn.Parameter(torch.full_like(sharpness.detach(), own))
+        return self.changed(layout=layout, move_logits=moves, log_sharpness=sharpness)
 
     def start(self, places: int, fixed: bool = False) -> Tensor:
         return self.off_map.new_zeros(self._shape(places))

@@ -10,7 +10,7 @@ import math
 from typing import NamedTuple
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from dejavu_torch.memory import check_room
 from dejavu_torch.places.layout import Layout
@@ -48,9 +48,9 @@ class Swept(NamedTuple):
 @torch.no_grad()
 def place_flight(
     smoother: PlaceSmoother, rows: Rows, queries: int, layout: Layout, spacing: Spacing
-) -> Tensor:
-    """The mass of each window of an area for each query of a flight, (Q,N); what is off the area is missing.
-    The smoother knows afterwards what was learned from the queries, and whether they are a flight over it.
+) -> tuple[Tensor, PlaceSmoother]:
+    """The mass of each window of an area for each query of a flight, (Q,N), without what is off the area, and
+    a smoother that has learned from the queries, which knows whether they are a flight over it.
 
     Args:
         rows: scores (B,N) of queries by their numbers. queries: Q. spacing: `spacing_of` their descriptors.
@@ -60,13 +60,13 @@ def place_flight(
     """
     cells = layout.rows * layout.columns
     check_room(BYTES * queries * cells, f"a drive of {queries} images over {cells} rows x columns")
-    smoother.forget()
     scores = rows(torch.arange(queries)).float().cpu()
     weight = spacing.weight.to(scores)
     means = smoother.removed * place_means(scores, weight)
     std, ranks = standardised(scores, means), RankTable()
     ranks.add(std.z, std.only((weight * std.speaks)[:, None].expand_as(std.z), 0))
-    smoother.correlation, smoother.tempering = spacing.correlation, tempering_of(spacing)
+    tempering = tempering_of(spacing)
+    smoother = smoother.forgetful().changed(correlation=spacing.correlation, tempering=tempering)
     reach, first = len(smoother.move_logits) - 1, max(0, (queries - FITTED) // 2)
     part = slice(first, first + FITTED)
     some, own = std.map(lambda column: column[part]), weight[part]
@@ -86,12 +86,15 @@ def place_flight(
         kernel = swept.moves + prior
         kernel = kernel / kernel.sum()
     swept = _sweep(smoother, layout, std, weight, spacing.still, table.values, separation, kernel)
-    smoother.separation, smoother.log_likelihood = separation, swept.log
-    smoother.nats_per_query = smoother.tempering * swept.log / max(1.0, float(weight.sum()))
-    smoother.is_drive = moves_along(swept.log, smoother.nats_per_query)  # jumps are not learned
+    nats_per_query = tempering * swept.log / max(1.0, float(weight.sum()))
     moves = torch.zeros(reach + 1).index_add_(0, rings(reach).flatten(), kernel.flatten())
-    smoother.move_logits.copy_(logits(*moves.tolist()))
-    return layout.by_place(swept.mass)
+    return layout.by_place(swept.mass), smoother.changed(
+        separation=separation,
+        log_likelihood=swept.log,
+        nats_per_query=nats_per_query,
+        is_drive=moves_along(swept.log, nats_per_query),  # jumps are not learned
+        move_logits=nn.Parameter(logits(*moves.tolist()).to(smoother.move_logits)),
+    )
 
 
 def _sweep(

@@ -89,7 +89,7 @@ class LargeDrive:
         best = self._pooled()
         self.windows = self._windows(best, candidates * (1 + math.ceil(radius / self.group)))
         del best
-        self._fit(self._scored())
+        self.smoother = self._fitted_by(self._scored())  # to the drive
 
     def _means(self) -> Tensor:
         """The mean score of each place over some of the queries, (N,)."""
@@ -160,7 +160,7 @@ class LargeDrive:
         def rows(numbers: Tensor) -> Tensor:
             return best[numbers].float()
 
-        coarse.fit(rows, self.scorer.descriptors, starts)
+        coarse = coarse.fit(rows, self.scorer.descriptors, starts)
         count = max(1, round(self.queries / WINDOW))
         ends = torch.linspace(0, self.queries, count + 1).round().int().tolist()
         around = [(max(0, a - MARGIN), min(self.queries, b + MARGIN)) for a, b in pairwise(ends)]
@@ -224,8 +224,7 @@ class LargeDrive:
         lengths = [min(FITTED // count, windows[i].last - windows[i].first) for i in chosen]
         return {i: min(pair) for i, *pair in zip(chosen, most, lengths, strict=True)}
 
-    def _fit(self, ranks: RankTable) -> None:
-        self.smoother.forget()
+    def _fitted_by(self, ranks: RankTable) -> PlaceSmoother:
         samples = []
         for i, length in self._fitted().items():
             window = self.windows[i]
@@ -233,8 +232,7 @@ class LargeDrive:
             std = sample.std
             ranks.add(std.z, std.only((sample.weight * std.speaks)[:, None].expand_as(std.z), 0))
             samples.append(sample)
-        self.smoother.means = self.means
-        self.smoother.learn(samples, ranks, self.spacing)
+        return self.smoother.taught(samples, ranks, self.spacing, self.means)
 
     def _sample(self, window: Window, some: slice) -> FittedPart:
         z = window.z[some.start - window.start : some.stop - window.start].float()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import math
 import threading
 from collections.abc import Callable, Iterator, Mapping
@@ -19,30 +18,21 @@ from dejavu_torch.places.layout import ROUTE, Layout
 from dejavu_torch.recognition.calibration import TOLERANCE, Platt, Track, best_pair, confidence_of
 from dejavu_torch.recognition.calibration import confidence as confidence_of_pair
 from dejavu_torch.recognition.drive import DriveQuery, first_of, localize_drive
-from dejavu_torch.recognition.samples import GROUP, RowSearch
-from dejavu_torch.recognition.scorer import BestOf, Earlier, Scorer, of_stored
-from dejavu_torch.recognition.search import SCORES_AT_ONCE, NmsSpec, Scan, Search, Searcher, num_needed
+from dejavu_torch.recognition.scorer import BestOf, Earlier, OfMap, Scorer, of_stored
+from dejavu_torch.recognition.search import Search, Searcher
 from dejavu_torch.recognition.select import Acceptance, accept, best_candidates, best_match
 from dejavu_torch.recognition.smoother import PlaceSmoother
 from dejavu_torch.recognition.taken import (
     AT_FIRST,
     EVERY,
-    FAITHFUL,
     SURER,
     Running,
     doubted,
-    flipped,
-    middle,
 )
 from dejavu_torch.text import with_progress
 from dejavu_torch.types import Match, SequenceModel, Together, expect
 
-ROWS = 4096  # descriptors on the device at a time
 CACHED = 2**20  # scores processed at a time: they stay in the cache
-SHORT = 2**15  # places of which all scores are kept: selecting the lowest of so few takes longer
-MAX_SHARE = 1 / 16  # of a block's places; selecting more of the lowest scores is slower than keeping all
-PLACES_PER_NUMBER = 64  # a coarse search holds at most one number of a query per this many places
-PER_BEST = 16  # held for each of a query's lowest scores, while two lists are merged
 
 
 class Matching(NamedTuple):
@@ -57,7 +47,6 @@ class Matching(NamedTuple):
     single: Platt | None = None  # that of single queries, beside a filter's
     callback: Callable[[Tensor], None] | None = None  # receives the final scores (B,N)
     search: Search = "auto"  # of single queries, see `DejaVu.localize`
-    removed: float = 1.0  # of each place's mean score, by a smoother
     apart: int | None = None  # queries are the places themselves; only those over this many before answer
     copies: int = 1  # rows of each query, evenly turned: each place has the best score of them
 
@@ -98,17 +87,16 @@ class Localizer:
         sequence = None if matching.sequence is None else matching.sequence.over(layout)
         matching = matching._replace(sequence=sequence, also=also)
         self.place_map, self.matching, self.track = place_map, matching, Track(layout)
-        # what single images say so far, beside mirrored ones, if these are asked
-        self.running = Running(SURER[layout.dimensions])
         self.lock = threading.RLock()
-        self.total: Tensor | None = None  # of the queries so far
+        # what single images say so far, beside mirrored ones, if these are asked
+        self.running, self.total = Running(SURER[layout.dimensions]), torch.zeros(())  # sum of the queries
         filters = sequence is not None and sequence.answers == "filter"
-        asks = filters and matching.platt is not None and matching.copies == 1
-        if asks and place_map is not None and (place_map.fidelity or 0) >= FAITHFUL:
-            self.total = torch.zeros(place_map.dimension)
+        self.asks: bool | None = None  # not known before the first query
+        if not filters or matching.platt is None or matching.copies > 1:
+            self.asks = False
         # probabilities, each by itself, of queries that a filter has yet to answer
         self.alone = torch.empty(0, dtype=torch.float64)
-        self.searcher = Scan(place_map) if searcher is None and place_map is not None else searcher
+        self.searcher = searcher
         self.own: Together = "filter" if sequence is None else sequence.key
         self.models: dict[Together, SequenceModel] = {**matching.also}
         if sequence is not None:
@@ -117,8 +105,9 @@ class Localizer:
         self.route_starts = layout.starts
 
     def __call__(self, descriptors: Tensor, progress: bool = False) -> Match:
+        assert self.place_map is not None
         with self.alone_asked():
-            return self._answered(descriptors, progress)
+            return self.next(OfMap(self.place_map, descriptors, self.searcher), progress)
 
     @contextmanager
     def alone_asked(self) -> Iterator[None]:
@@ -130,115 +119,76 @@ class Localizer:
             self.lock.release()
 
     @torch.no_grad()
-    def _answered(self, descriptors: Tensor, progress: bool) -> Match:
-        place_map, matching = self.place_map, self.matching
-        assert place_map is not None
-        places = place_map.places
-        if not len(descriptors):
-            return self.match(descriptors.new_zeros(0, places))
-        wanted = [(matching.k or 1, matching.radius), (min(2, places), TOLERANCE)]
-        n = num_needed(wanted, self.layout)
-        few = n <= max(1, MAX_SHARE * min(places, place_map.block_places)) or places > SCORES_AT_ONCE
-        searches = not self.models and matching.callback is None
-        searches = searches and (type(self.searcher) is not Scan or (few and places > SHORT))
-        per_number = GROUP if isinstance(self.searcher, RowSearch) else PLACES_PER_NUMBER
-        size = max(PER_BEST * n, places // per_number) if searches else places
-        parts = descriptors.split(whole(min(ROWS, SCORES_AT_ONCE // size), matching.copies))
-        moved = (part.to(place_map.device) for part in with_progress(parts, "localizing", progress))
-        if searches:
-            match = Match.joined(self._search(part, wanted) for part in moved)
-        else:
-            match = Match.joined(self.match(place_map.scores(part), self._mirrored(part)) for part in moved)
-        return self._without_blank(match, descriptors[:: matching.copies])
+    def next(self, scorer: Scorer, progress: bool = False, verb: str = "localizing") -> Match:
+        """Match the next queries, which are those of a scorer, or all copies of them, see `wrapped`."""
+        scorer, k, radius = wrapped(scorer, self.matching), self.matching.k or 1, self.matching.radius
+        if not len(scorer):
+            return self.match(torch.zeros(0, max(1, self.layout.places)))
+        wanted = [(k, radius), (min(2, self.layout.places), TOLERANCE)]
+        if self.models or self.matching.callback is not None:  # they need all scores
+            wanted = []
+        parts = list[Match]()
+        for part in with_progress(scorer.parts(wanted), verb, progress):
+            if wanted:
+                match = self._alone(*scorer.best(part, wanted))
+            else:
+                match = self.match(scorer.rows(part), scorer.stored, self._mirrored(scorer, part))
+            parts.append(self._turned(match, scorer, part))
+        return self._without_blank(Match.joined(parts), scorer)
 
-    def _mirrored(self, descriptors: Tensor) -> Tensor | None:
+    def _mirrored(self, scorer: Scorer, queries: Tensor) -> Tensor | None:
         """Confidences in some of the queries, mirrored, (B,), NaN for the others, if a filter's answers get
         probabilities."""
-        place_map = self.place_map
-        if self.total is None:
+        if self.asks is None:
+            self.asks = scorer.null is not None
+        if not self.asks:
             return None
-        assert place_map is not None
+        assert scorer.null is not None
+        descriptors = scorer.descriptors[queries.to(scorer.descriptors.device)]
         numbers = torch.arange(len(descriptors)) + self.running.queries
         sums = self.total.to(descriptors) + descriptors.nan_to_num(0).cumsum(0)
-        means = middle(sums, 1 + numbers.to(sums)[:, None], place_map.mean)
         found = descriptors.new_full((len(descriptors),), math.nan)
         some = (numbers < AT_FIRST) | (numbers % EVERY == 0)
         if bool(some.any()):
-            scores = place_map.scores(flipped(descriptors[some], mean=means[some]))
-            found[some] = confidence_of(scores, self.layout)
+            so_far = sums[some], 1 + numbers.to(sums)[some, None]
+            found[some] = confidence_of(scorer.null(queries[some], so_far=so_far), self.layout)
         self.total = sums[-1]
         return found
 
     @torch.no_grad()
-    def match(self, scores: Tensor, mirrored: Tensor | None = None) -> Match:
-        """Match the next queries by their scores: (B,N), or (B x copies, N) -> (B,), or (B,k); mirrored: see
-        `_mirrored`."""
+    def match(self, scores: Tensor, stored: Tensor | None = None, mirrored: Tensor | None = None) -> Match:
+        """Match the next queries by their scores: (B,N) -> (B,), or (B,k).
+
+        Args:
+            stored: the only places that single images find, (n,). mirrored: see `_mirrored`.
+        """
         if mirrored is not None:
             odds = self.running(confidence_of(scores, self.layout), mirrored)
             platt = self.matching.single or Platt(0.0, math.inf)
             alone = platt.probability(confidence_of(scores, self.layout, platt.margin))
             self.alone = torch.cat([self.alone, alone])
-            match = self.match(scores)
+            match = self.match(scores, stored)
             return self._doubted(match, odds[len(odds) - len(match.index) :])
-        turn, copies = None, self.matching.copies
-        if copies > 1:
-            scores, turn = scores.view(-1, copies, scores.shape[1]).min(1)
-        parts = scores.split(max(1, CACHED // scores.shape[1]))
-        turns = [None] * len(parts) if turn is None else turn.split(len(parts[0]))
         if not self.models:
-            return Match.joined(map(self._alone, parts, turns))
+            return self._alone(scores if stored is None else of_stored(scores, stored))
         with in_one_thread(scores.shape[1]):
-            return Match.joined(map(self._in_sequence, parts, turns))
+            return Match.joined(
+                self._in_sequence(part, stored) for part in scores.split(max(1, CACHED // scores.shape[1]))
+            )
 
-    def drive(self, scorer: Scorer, smoother: PlaceSmoother, progress: bool = False) -> Match:
-        """Match all queries of a drive by a smoother, which is fitted to them; see `localize_drives`.
+    def _turned(self, match: Match, scorer: Scorer, queries: Tensor) -> Match:
+        """The match of queries with its headings, if there are copies of them, and these answer now."""
+        sequence = self.matching.sequence
+        return (
+            match if sequence is not None and sequence.lag else headed(match, scorer, queries, self.matching)
+        )
 
-        Args:
-            scorer: of the queries, and of all copies of them, see `wrapped`.
-        """
-        scorer = wrapped(scorer, self.matching)
-        asked = self.drive_query(scorer, smoother)
-        match = localize_drive(asked, progress)
-        acceptance = self.matching.acceptance
-        # whose scores are distances
-        if acceptance.threshold is not None and not smoother.is_drive and not asked.checks:
-            acceptance = Acceptance(precision=math.exp(-acceptance.threshold))
-        return self._accepted(self._turned(scorer, match), acceptance)
-
-    def match_all(self, scorer: Scorer, progress: bool = False) -> Match:
-        """Match all queries by their scores, each by itself, or by a sequence or filter."""
-        match = match_scores(scorer, self.matching, progress)
-        scorer = wrapped(scorer, self.matching)
-        return self._without_blank(self._turned(scorer, match), scorer.descriptors)
-
-    def _turned(self, scorer: Scorer, match: Match) -> Match:
-        """The match with its headings, if there are copies of the queries."""
-        if self.matching.copies == 1:
+    def _without_blank(self, match: Match, scorer: Scorer) -> Match:
+        """The match, in which blank frames find nothing by themselves."""
+        if self.matching.sequence is not None or scorer.blank_finds:
             return match
-        each = max(1, SCORES_AT_ONCE // (self.matching.copies * scorer.layout.places))
-        index = match.index.view(len(scorer), -1 if len(scorer) else 1)
-        parts = zip(torch.arange(len(scorer)).split(each), index.split(each), strict=True)
-        turn = torch.cat([index[:0], *(scorer.copy_at(*part) for part in parts)]).view_as(match.index)
-        return replace(match, heading=self._heading_of(turn, match.index))
-
-    def _without_blank(self, match: Match, descriptors: Tensor) -> Match:
-        """The match, in which blank frames find nothing by themselves; descriptors (B,K)."""
-        if self.matching.sequence is not None or getattr(self.place_map, "metric", "") != "cosine":
-            return match
-        shows = descriptors.any(1).cpu().view(-1, *[1] * (match.accepted.ndim - 1))
+        shows = scorer.descriptors.any(1).cpu().view(-1, *[1] * (match.accepted.ndim - 1))
         return replace(match, accepted=match.accepted & shows)
-
-    def _heading_of(self, turn: Tensor, index: Tensor) -> Tensor:
-        """The heading of copies in degrees, NaN where the place `index` is -1."""
-        heading = turn * (360 / self.matching.copies) - self.layout.north
-        return (heading % 360).float().masked_fill(index < 0, torch.nan)
-
-    def drive_query(self, scorer: Scorer, smoother: PlaceSmoother) -> DriveQuery:
-        """What `drive` matches."""
-        matching = self.matching
-        smoother.map_links, smoother.removed = scorer.links, matching.removed
-        settings = matching.k or 1, matching.radius, matching.platt
-        return DriveQuery(scorer, smoother, *settings, checks=matching.apart is not None)
 
     @torch.no_grad()
     def skip(self, queries: int) -> None:
@@ -274,33 +224,39 @@ class Localizer:
         state = self.states.get("filter")
         return state if state is None or state.ndim == 1 else state[0]
 
-    def _alone(self, scores: Tensor, turn: Tensor | None) -> Match:
-        return self._answer(self._candidates(scores, turn), best_pair(scores, self.layout))
+    def _alone(self, scores: Tensor, places: Tensor | None = None) -> Match:
+        """Match single images by their scores, of all places or of those that are named."""
+        if places is not None:
+            return self._answer(self._candidates(scores, places), best_pair(scores, self.layout, places))
+        parts = scores.split(max(1, CACHED // scores.shape[1]))
+        return Match.joined(
+            self._answer(self._candidates(part), best_pair(part, self.layout)) for part in parts
+        )
 
-    def _in_sequence(self, scores: Tensor, turn: Tensor | None = None, last: bool = False) -> Match:
+    def _in_sequence(self, scores: Tensor, stored: Tensor | None = None, last: bool = False) -> Match:
         states = self.states or {T: m.start(scores.shape[1]).to(scores) for T, m in self.models.items()}
         steps = {T: m.step(scores, states[T], self.route_starts) for T, m in self.models.items()}
-        sequence, single = self.matching.sequence, self.matching.sequence is None
+        sequence, found = self.matching.sequence, {T: final for T, (final, _) in steps.items()}
         if sequence is not None and sequence.lag:
             if last:
                 steps[self.own] = sequence.finish(states[self.own], self.route_starts)
+                found[self.own] = steps[self.own][0]
             answered = torch.cat([sequence.waiting(states[self.own]), scores])
-            scores, turn = answered[: len(steps[self.own][0])], None  # not those of the queries answered
-        final = scores if single else steps[self.own][0]
+            scores = answered[: len(found[self.own])]
+        if stored is not None:
+            found[1] = of_stored(scores, stored)  # else another place would be the same stored frame
+        final = found.get(1, scores) if sequence is None else found[self.own]
         pair, confidence = best_pair(final, self.layout), None
-        if self.matching.platt is not None and not single:
+        if self.matching.platt is not None and sequence is not None:
             confidence = self.track(final, scores)
-        match = self._answer(self._candidates(final, turn), pair, confidence)
+        match = self._answer(self._candidates(final), pair, confidence)
         self.states = {T: state for T, (_, state) in steps.items()}
-        sequences = {T: best_match(steps[T][0]).map(Tensor.cpu) for T in self.matching.also}
-        return replace(match, sequences=sequences)
+        return replace(match, sequences={T: best_match(found[T]).map(Tensor.cpu) for T in self.matching.also})
 
-    def _candidates(self, scores: Tensor, turn: Tensor | None = None) -> Match:
+    def _candidates(self, scores: Tensor, places: Tensor | None = None) -> Match:
         if self.matching.callback is not None:
             self.matching.callback(scores)
-        match = best_candidates(scores, self.matching.k or 1, self.matching.radius, layout=self.layout)
-        best = None if turn is None else turn.gather(1, match.index.clamp(min=0))
-        return match if best is None else replace(match, heading=self._heading_of(best, match.index))
+        return best_candidates(scores, self.matching.k or 1, self.matching.radius, places, self.layout)
 
     def _answer(self, match: Match, pair: Match, confidence: Tensor | None = None) -> Match:
         """Candidates (B,k) with all that is known of them.
@@ -314,31 +270,29 @@ class Localizer:
         if platt is not None:
             known = confidence_of_pair(pair, platt.margin) if confidence is None else confidence
             match = replace(match, probability=first_of(platt.probability(known), k))
-        return self._accepted(match)
+        return judged(match, self.matching, self.layout)
 
-    def _accepted(self, match: Match, acceptance: Acceptance | None = None) -> Match:
-        """Candidates (B,k) with their acceptance and routes, on the CPU; (B,) for best places alone."""
-        matching, match = self.matching, match.map(Tensor.cpu)
-        threshold, precision, _ = acceptance or matching.acceptance
-        match = replace(match, accepted=accept(match.score, threshold))
-        if match.probability is not None and precision is not None:
-            match = replace(match, accepted=match.probability >= precision)
-        match = replace(match, route=self.layout.told_routes(match.index))
-        return match if matching.k is not None else match.map(lambda column: column[:, 0])
 
-    def _search(self, descriptors: Tensor, wanted: list[NmsSpec]) -> Match:
-        """Candidates from the lowest scores alone; `wanted` has those of the answer first."""
-        assert self.searcher is not None
-        score, place = self.searcher(descriptors, wanted)
-        copies, each = self.matching.copies, score.shape[1]
-        # the best of all copies are among the best of each
-        score, place = score.view(-1, copies * each), place.view(-1, copies * each)
-        match, pair = (best_candidates(score, *spec, place, self.layout) for spec in wanted)
-        if copies > 1:
-            found = (place[:, None] == match.index[..., None]) & (score[:, None] == match.score[..., None])
-            turn = found.byte().argmax(2) // each
-            match = replace(match, heading=self._heading_of(turn, match.index))
-        return self._answer(match, pair)
+def judged(match: Match, matching: Matching, layout: Layout, acceptance: Acceptance | None = None) -> Match:
+    """Candidates (B,k), found in any way, with their acceptance and routes, on the CPU; (B,) of best places
+    alone."""
+    match = match.map(Tensor.cpu)
+    threshold, precision, _ = acceptance or matching.acceptance
+    match = replace(match, accepted=accept(match.score, threshold))
+    if match.probability is not None and precision is not None:
+        match = replace(match, accepted=match.probability >= precision)
+    match = replace(match, route=layout.told_routes(match.index))
+    return match if matching.k is not None else match.map(lambda column: column[:, 0])
+
+
+def headed(match: Match, scorer: Scorer, queries: Tensor, matching: Matching) -> Match:
+    """The match of queries (B,) with its headings in degrees, if there are copies of them."""
+    if matching.copies == 1:
+        return match
+    index = match.index.view(len(queries), -1)
+    turn = scorer.copy_at(queries, index).cpu().view_as(match.index)
+    heading = (turn * (360 / matching.copies) - scorer.layout.north) % 360
+    return replace(match, heading=heading.float().masked_fill(match.index < 0, torch.nan))
 
 
 def wrapped(scorer: Scorer, matching: Matching) -> Scorer:
@@ -347,46 +301,36 @@ def wrapped(scorer: Scorer, matching: Matching) -> Scorer:
     return scorer if matching.apart is None else Earlier(scorer, matching.apart)
 
 
-def drive_query(
-    scorer: Scorer, smoother: PlaceSmoother, asks: bool = False, removed: float | None = None
-) -> DriveQuery:
-    """Queries as a drive with scores of any kind, for a smoother like this one; `removed`: unless its own."""
-    smoother = copy.deepcopy(smoother)
-    own = smoother.removed if removed is None else removed
-    smoother.map_links, smoother.removed = scorer.links, own
-    return DriveQuery(scorer, smoother, radius=0, asks=asks)
-
-
 @torch.no_grad()
-def match_scores(
+def answer(
     scorer: Scorer, matching: Matching = SINGLE, progress: bool = False, verb: str = "localizing"
 ) -> Match:
-    """The matches of queries by their scores alone, sequences and filters by the uncentred ones. Single ones
-    find places that are `stored`, sequences also those between."""
-    if scorer.uncentred is not None and (matching.also or matching.sequence):
-        found = match_scores(scorer.uncentred, matching, progress, verb)
-        if matching.sequence is not None:
+    """Match all queries of a scorer, sequences and filters by the uncentred ones. Single images find places
+    that are `stored`, sequences also those between."""
+    way = matching.sequence
+    if isinstance(way, PlaceSmoother):
+        return _of_drive(scorer, way, matching, progress)
+    if scorer.uncentred is not None and (matching.also or way):
+        found = answer(scorer.uncentred, matching, progress, verb)
+        if way is not None:
             return found
-        alone = match_scores(scorer, matching._replace(also={}), progress, verb)
+        alone = answer(scorer, matching._replace(also={}), progress, verb)
         return replace(alone, sequences=found.sequences)
-    scorer, how = wrapped(scorer, matching), matching._replace(copies=1, apart=None)
-    matcher = Localizer(None, how, layout=scorer.layout)
-    singly = Localizer(None, how._replace(sequence=None, also={}), layout=scorer.layout)
-    single, parts = matching.sequence is None or matcher.own == 1, list[Match]()
-    for part in with_progress(scorer.parts(), verb, progress):
-        scores = scorer.rows(part)
-        match = matcher.match(scores)
-        if scorer.stored is not None and (single or 1 in match.sequences):
-            # else another place would be the same stored frame
-            one = singly.match(of_stored(scores, scorer.stored))
-            sequences = {T: one if T == 1 else several for T, several in match.sequences.items()}
-            match = replace(one if single else match, sequences=sequences)
-        parts.append(match)
-    if matching.sequence is not None and matching.sequence.lag:
-        parts.append(matcher.finish())
-    return Match.joined(parts)
+    localizer = Localizer(None, matching, layout=scorer.layout)
+    match = localizer.next(scorer, progress, verb)
+    return Match.joined([match, localizer.finish()]) if way is not None and way.lag else match
 
 
-def whole(rows: int, copies: int) -> int:
-    """So many rows at a time, but at least one, and all copies of a query together."""
-    return max(1, rows // copies) * copies
+def _of_drive(scorer: Scorer, smoother: PlaceSmoother, matching: Matching, progress: bool) -> Match:
+    """Match all queries of a drive."""
+    scorer, checks = wrapped(scorer, matching), matching.apart is not None
+    asked = DriveQuery(scorer, smoother, matching.k or 1, matching.radius, matching.platt, checks)
+    match, acceptance = localize_drive(asked, progress), matching.acceptance
+    # whose scores are distances
+    if acceptance.threshold is not None and not match.is_drive and not checks:
+        acceptance = Acceptance(precision=math.exp(-acceptance.threshold))
+    match = judged(match, matching, scorer.layout, acceptance)
+    if matching.copies == 1:
+        return match
+    parts = torch.arange(len(scorer)).split(max(1, scorer.at_once // scorer.layout.places))
+    return Match.joined(headed(match[part], scorer, part, matching) for part in parts)

@@ -6,8 +6,11 @@ Wrappers are composed from inside out: `Reordered`, `BestOf`, `Earlier`.
 from __future__ import annotations
 
 import math
+import sys
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from functools import cached_property
+from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -17,13 +20,32 @@ from dejavu_torch.maps.distance import Metric, phase_distances
 from dejavu_torch.maps.place_map import PlaceMap, ScoreBlocks
 from dejavu_torch.places.layout import ROUTE, Layout
 from dejavu_torch.places.states import Link
-from dejavu_torch.recognition.search import SCORES_AT_ONCE
+from dejavu_torch.recognition.samples import GROUP, RowSearch
+from dejavu_torch.recognition.search import SCORES_AT_ONCE, NmsSpec, Scan, Searcher, num_needed
 from dejavu_torch.recognition.taken import ALONE, FAITHFUL, flipped, middle
 
 BLOCK_DISTANCES = 2**22  # of queries x stored frames, computed at a time
+ROWS = 4096  # descriptors on the device at a time
+SHORT = 2**15  # places of which all scores are kept: selecting the lowest of so few takes longer
+MAX_SHARE = 1 / 16  # of a block's places; selecting more of the lowest scores is slower than keeping all
+PLACES_PER_NUMBER = 64  # a coarse search holds at most one number of a query per this many places
+PER_BEST = 16  # held for each of a query's lowest scores, while two lists are merged
 
 Rows = Callable[[Tensor], Tensor]  # scores (B,N) of queries by their numbers (B,)
-Null = Callable[..., Tensor]  # as `Rows`, of queries that show no place, for a `seed`
+Wanted = Sequence[NmsSpec]
+Lowest = tuple[Tensor, Tensor | None]  # scores (B,n) and their places; None are all places in order
+
+
+class Null(Protocol):
+    """As `Rows`, of queries that are `flipped`, for a seed.
+
+    Args:
+        so_far: sums (B,K) and counts (B,1) of the queries that each is mirrored about; None is all of them.
+    """
+
+    def __call__(
+        self, queries: Tensor, seed: int = 0, so_far: tuple[Tensor, Tensor] | None = None
+    ) -> Tensor: ...
 
 
 class Scorer(ABC):
@@ -34,9 +56,11 @@ class Scorer(ABC):
         links: steps from one place to another, see `PlaceSmoother`.
         null: as `rows`, of `flipped` queries, for a seed; without it their order alone tells whether they are
             a drive, by at least `least` nats for each query.
-        at_once: numbers that are computed together. stored: the places that are stored themselves, (n,), if
-            others have the scores of these. uncentred: of the same queries as they are, for ways that do not
-            know all of them; None if these are. It belongs to the outermost: wrappers do not pass it on.
+        at_once: numbers that are computed together, of `most` queries. stored: the places that are stored
+            themselves, (n,), if others have the scores of these. blank_finds: whether a blank query may find
+            a place by itself.
+        uncentred: of the same queries as they are, for ways that do not know all of them; None if these are.
+            It belongs to the outermost: wrappers do not pass it on.
     """
 
     layout: Layout
@@ -45,7 +69,9 @@ class Scorer(ABC):
     null: Null | None = None
     least: float = 0.0
     at_once: int = SCORES_AT_ONCE
+    most: int = sys.maxsize
     stored: Tensor | None = None
+    blank_finds: bool = True
     uncentred: Scorer | None = None
 
     def __len__(self) -> int:
@@ -59,9 +85,19 @@ class Scorer(ABC):
         """The columns of `rows`, block by block."""
         yield 0, self.rows(queries)
 
+    def best(self, queries: Tensor, wanted: Wanted) -> Lowest:
+        """Scores that include those of the `wanted` candidates. Places that are not stored are none: each
+        would be the same stored one again."""
+        scores = self.rows(queries)
+        return scores if self.stored is None else of_stored(scores, self.stored), None
+
     @property
     def width(self) -> int:
         """About how many numbers a query has in a block."""
+        return self.layout.places
+
+    def held(self, wanted: Wanted) -> int:
+        """How many numbers of a query are in memory, all its scores or what finds the `wanted` ones."""
         return self.layout.places
 
     def copy_at(self, queries: Tensor, places: Tensor) -> Tensor:
@@ -73,20 +109,51 @@ class Scorer(ABC):
         self.uncentred = uncentred
         return self
 
-    def parts(self) -> list[Tensor]:
-        """The numbers of all queries, as many as are scored together."""
-        size = max(1, self.at_once // max(1, self.layout.places))
+    def parts(self, wanted: Wanted = ()) -> list[Tensor]:
+        """The numbers of all queries, as many as are scored, or searched for `wanted` ones, together."""
+        size = max(1, min(self.most, self.at_once // max(1, self.held(wanted))))
         return [*torch.arange(len(self)).split(size)]
 
 
 class OfMap(Scorer):
-    """Of a map and descriptors (Q,K)."""
+    """Of a map and descriptors (Q,K); `searcher` finds the best places, by default a `Scan`."""
 
-    def __init__(self, place_map: PlaceMap, descriptors: Tensor) -> None:
+    most = ROWS
+
+    def __init__(self, place_map: PlaceMap, descriptors: Tensor, searcher: Searcher | None = None) -> None:
         self.place_map, self.descriptors = place_map, descriptors
         self.layout, self.links = place_map.layout, place_map.connections
-        if (kept := place_map.fidelity) is not None:  # templates repeat along the route
-            self.null, self.least = (self._mirrored, 0.0) if kept >= FAITHFUL else (None, ALONE)
+        self.searcher = Scan(place_map) if searcher is None else searcher
+        self.blank_finds = getattr(place_map, "metric", "") != "cosine"
+
+    @cached_property
+    def fidelity(self) -> float | None:
+        """That of the map; None of templates, which repeat along the route."""
+        return self.place_map.fidelity
+
+    @property
+    def null(self) -> Null | None:  # type: ignore[override]
+        return self._mirrored if self.fidelity is not None and self.fidelity >= FAITHFUL else None
+
+    @property
+    def least(self) -> float:  # type: ignore[override]
+        return ALONE if self.fidelity is not None and self.fidelity < FAITHFUL else 0.0
+
+    def best(self, queries: Tensor, wanted: Wanted) -> Lowest:
+        found = self._searches(wanted)
+        return self.searcher(self._asked(queries), [*wanted]) if found else super().best(queries, wanted)
+
+    def held(self, wanted: Wanted) -> int:
+        if not wanted or not self._searches(wanted):
+            return self.layout.places
+        per_number = GROUP if isinstance(self.searcher, RowSearch) else PLACES_PER_NUMBER
+        return max(PER_BEST * num_needed([*wanted], self.layout), self.layout.places // per_number)
+
+    def _searches(self, wanted: Wanted) -> bool:
+        """Whether to search for the best places is faster than to look through all scores."""
+        places, n = self.layout.places, num_needed([*wanted], self.layout)
+        few = n <= max(1, MAX_SHARE * min(places, self.place_map.block_places)) or places > SCORES_AT_ONCE
+        return type(self.searcher) is not Scan or (few and places > SHORT)
 
     def rows(self, queries: Tensor) -> Tensor:
         return self.place_map.scores(self._asked(queries))
@@ -101,9 +168,12 @@ class OfMap(Scorer):
     def _asked(self, queries: Tensor) -> Tensor:
         return self.descriptors[queries.to(self.descriptors.device)].to(self.place_map.device)
 
-    def _mirrored(self, queries: Tensor, seed: int) -> Tensor:
-        mean = middle(self.descriptors.sum(0), len(self.descriptors), self.place_map.mean)
-        asked = flipped(self.descriptors[queries.to(self.descriptors.device)], seed, mean)
+    def _mirrored(
+        self, queries: Tensor, seed: int = 0, so_far: tuple[Tensor, Tensor] | None = None
+    ) -> Tensor:
+        total, count = so_far or (self.descriptors.sum(0), len(self.descriptors))
+        asked = self.descriptors[queries.to(self.descriptors.device)]
+        asked = flipped(asked, seed, middle(total, count, self.place_map.mean))
         return self.place_map.scores(asked.to(self.place_map.device))
 
 
@@ -148,10 +218,18 @@ class Wrapped(Scorer):
 
     def __init__(self, scorer: Scorer) -> None:
         self.scorer, self.layout, self.descriptors = scorer, scorer.layout, scorer.descriptors
-        self.links, self.least, self.at_once = scorer.links, scorer.least, scorer.at_once
-        self.stored = scorer.stored
-        if (null := scorer.null) is not None:
-            self.null = lambda queries, seed: self.changed(null(self.asked(queries), seed=seed), queries)
+        self.links, self.at_once, self.most = scorer.links, scorer.at_once, scorer.most
+        self.stored, self.blank_finds = scorer.stored, scorer.blank_finds
+
+    @property
+    def null(self) -> Null | None:  # type: ignore[override]
+        if (null := self.scorer.null) is None:
+            return None
+        return lambda queries, *how, **so: self.changed(null(self.asked(queries), *how, **so), queries)
+
+    @property
+    def least(self) -> float:  # type: ignore[override]
+        return self.scorer.least
 
     def changed(self, scores: Tensor, queries: Tensor) -> Tensor:
         """What becomes of the scores of queries (B,)."""
@@ -172,9 +250,11 @@ class Reordered(Wrapped):
     """Scores of a map whose places are the frames `order` (N,), frame by frame. Of a shuffled map, a control,
     nothing is asked first: its order is lost."""
 
+    null, least = None, 0.0
+
     def __init__(self, scorer: Scorer, order: Tensor) -> None:
         super().__init__(scorer)
-        self.place, self.null, self.least = order.argsort(), None, 0.0
+        self.place = order.argsort()
         self.stored = None if scorer.stored is None else order[scorer.stored.to(order.device)]
 
     def changed(self, scores: Tensor, queries: Tensor) -> Tensor:
@@ -188,9 +268,11 @@ class Earlier(Wrapped):
     """Queries are the places themselves: only those over `apart` before a query answer; blank ones find
     nothing."""
 
+    null, least = None, 0.0
+
     def __init__(self, scorer: Scorer, apart: int) -> None:
         super().__init__(scorer)
-        self.apart, self.null, self.least = apart, None, 0.0
+        self.apart = apart
 
     def changed(self, scores: Tensor, queries: Tensor) -> Tensor:
         blank = ~self.descriptors[queries.to(self.descriptors.device)].any(1, keepdim=True)
@@ -199,23 +281,48 @@ class Earlier(Wrapped):
 
 class BestOf(Wrapped):
     """Each query is so many consecutive ones of another scorer, such as its turned copies: a place has the
-    best score of them."""
+    best score of them. What was scored last is kept until it is known which copy answers."""
 
     def __init__(self, scorer: Scorer, copies: int) -> None:
         self.copies = copies
         super().__init__(scorer)
         self.descriptors, self.at_once = scorer.descriptors[::copies], scorer.at_once // copies
+        self.most = max(1, scorer.most // copies)
+        self.last: tuple[Tensor, Tensor, Tensor | None] | None = None
 
     def asked(self, queries: Tensor) -> Tensor:
         return (queries[:, None] * self.copies + torch.arange(self.copies)).flatten()
 
+    def held(self, wanted: Wanted) -> int:
+        return self.scorer.held(wanted)
+
     def changed(self, scores: Tensor, queries: Tensor) -> Tensor:
         return scores.view(-1, self.copies, scores.shape[1]).amin(1)
 
+    def rows(self, queries: Tensor) -> Tensor:
+        scores = self.scorer.rows(self.asked(queries))
+        self.last = queries, scores, None
+        return self.changed(scores, queries)
+
+    def best(self, queries: Tensor, wanted: Wanted) -> Lowest:
+        scores, places = self.scorer.best(self.asked(queries), wanted)
+        self.last = queries, scores, places
+        if places is None:
+            return self.changed(scores, queries), None
+        # the best of all copies are among the best of each
+        return scores.view(len(queries), -1), places.view(len(queries), -1)
+
     def copy_at(self, queries: Tensor, places: Tensor) -> Tensor:
-        scores = self.scorer.rows(self.asked(queries)).cpu().view(-1, self.copies, self.layout.places)
-        at = places.clamp(min=0)[:, None].expand(-1, self.copies, -1)
-        return scores.gather(2, at).argmin(1)
+        if self.last is None or self.last[0] is not queries:
+            self.rows(queries)
+        assert self.last is not None
+        _, scores, known = self.last
+        if known is None:
+            at = places.clamp(min=0)[:, None].expand(-1, self.copies, -1).to(scores.device)
+            return scores.view(-1, self.copies, self.layout.places).gather(2, at).argmin(1)
+        each, (scores, known) = scores.shape[1], (one.view(len(queries), -1) for one in (scores, known))
+        other = known[:, None] != places[..., None].to(known.device)
+        return scores[:, None].expand_as(other).masked_fill(other, math.inf).argmin(2) // each
 
 
 def earlier(scores: Tensor, numbers: Tensor, apart: int) -> Tensor:

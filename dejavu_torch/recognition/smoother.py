@@ -95,7 +95,7 @@ class FittedPart(NamedTuple):
         return FittedPart(std, self.weight[..., first:last], self.still[..., first:last], self.states)
 
 
-class Fit(NamedTuple):
+class Found(NamedTuple):
     """What expectation-maximisation found.
 
     log: nats by which the model beats being off the map. held: likewise, with jumps, and ways off the
@@ -184,7 +184,7 @@ class PlaceSmoother(SequenceModel):
         self.turn, self.separation, self.tempering = turn, float(separation), float(tempering)
         self.within, self.threshold = within, threshold
         self.links, self.loop = tuple(links), loop
-        self.map_links: tuple[Link, ...] = ()  # those of the map that a `Localizer` matches to
+        self.map_links: tuple[Link, ...] = ()  # those of the map
         self.removed = 1.0  # share of each place's mean score that is removed
         self.log_likelihood: float | None = None  # nats above being off the map throughout, as fitted
         self.nats_per_query = 0.0  # likewise, with rare jumps, as if queries did not depend on each other
@@ -348,60 +348,70 @@ class PlaceSmoother(SequenceModel):
             spacing: `spacing_of` these, if it is known.
 
         Returns:
-            self; `is_drive` tells whether the queries are a drive of the map at all.
+            A copy that has learned it; `is_drive` tells whether the queries are a drive of the map at all.
         """
         if isinstance(scores, Tensor):
             known = check_scores(scores, descriptors)
             scores, descriptors = rows_of(known), spoken(known) if descriptors is None else descriptors
         descriptors = check_descriptors(descriptors)
-        self.forget()
         if not len(descriptors):
-            return self
+            return self.forgetful()
         spacing = spacing or spacing_of(descriptors)
         places = scores(torch.zeros(1, dtype=torch.int64)).shape[1]
         repeated = len(descriptors) / float(spacing.weight.sum())  # where frames repeat, stretches are longer
         picked = stretches(len(descriptors), spacing.correlation, places, repeated)
         known = scores(picked.flatten())
         weight, still = spacing.weight.to(known), spacing.still.to(known.device)
-        self.means = self.removed * place_means(known, weight[picked.flatten()])
-        std = standardised(known, self.means).map(lambda column: column.unflatten(0, picked.shape))
+        means = self.removed * place_means(known, weight[picked.flatten()])
+        std = standardised(known, means).map(lambda column: column.unflatten(0, picked.shape))
         ranks = RankTable()
         ranks.add(std.z, std.only((weight[picked] * std.speaks)[..., None].expand_as(std.z), 0))
         states = self.states(places, route_starts)
-        return self.learn([FittedPart(std, weight[picked], still[picked], states)], ranks, spacing)
+        samples = [FittedPart(std, weight[picked], still[picked], states)]
+        return self.taught(samples, ranks, spacing, means)
 
-    def forget(self) -> None:
-        """What an earlier drive told."""
-        self.is_drive, self.log_likelihood, self.singly = False, None, None
-        self.nats_per_query = self.jumps = 0.0
+    def forgetful(self) -> Self:
+        """A copy without what an earlier drive told."""
+        forgotten = dict.fromkeys(("log_likelihood", "singly"))
+        return self.changed(is_drive=False, nats_per_query=0.0, jumps=0.0, **forgotten)
 
     @torch.no_grad()
-    def learn(self, samples: Sequence[FittedPart], ranks: RankTable, spacing: Spacing) -> Self:
-        """As `fit`, from stretches of the drive and the ranks of all their scores."""
-        self.correlation, self.tempering = spacing.correlation, tempering_of(spacing)
+    def taught(
+        self, samples: Sequence[FittedPart], ranks: RankTable, spacing: Spacing, means: Tensor
+    ) -> Self:
+        """As `fit`, from stretches of the drive, the ranks of all their scores, and the `means` of places."""
+        like = self.forgetful().changed(correlation=spacing.correlation, tempering=tempering_of(spacing))
         moving = float(sum((~sample.still).sum() for sample in samples))
         different = float(sum(sample.weight.sum() for sample in samples))
-        best = self._fitted(samples, ranks, self.prior, moving)
+        best = like._fitted(samples, ranks, self.prior, moving)
         if best.log < max(OTHER_SPEED, PER_QUERY * moving) and self.prior == MOVES:
-            others = (self._fitted(samples, ranks, start, moving) for start in (SLOW, FAST))
+            others = (like._fitted(samples, ranks, start, moving) for start in (SLOW, FAST))
             other = max(others, key=lambda one: one.log)
             least = max(OTHER_SPEED, PER_QUERY * different, CLEARLY * best.log)
             best = other if other.log >= least else best
-        self.nats_per_query = self.tempering * best.held / max(1.0, different)
-        self.is_drive, self.log_likelihood = moves_along(best.held, self.nats_per_query), best.log
-        self.jumps = best.log - best.held
-        if best.separation >= SURE and spacing.correlation >= SLOW_CHANGES * spacing.detrended:
-            self.tempering = spacing.detrended
-        self.separation, self.values = best.separation, best.values
+        nats_per_query = like.tempering * best.held / max(1.0, different)
+        slow = best.separation >= SURE and spacing.correlation >= SLOW_CHANGES * spacing.detrended
         jump, leave, enter = map(float, best.rates[1:])
-        self.move_logits.copy_(logits(*best.rates.moves.tolist()))
-        self.rate_logits.copy_(logits(1 - jump - leave, jump, leave))
-        self.enter_logit.copy_(logits(enter)[0] - logits(1 - enter)[0])
-        return self
+        learned = {
+            "move_logits": logits(*best.rates.moves.tolist()),
+            "rate_logits": logits(1 - jump - leave, jump, leave),
+            "enter_logit": logits(enter)[0] - logits(1 - enter)[0],
+        }
+        return like.changed(
+            nats_per_query=nats_per_query,
+            is_drive=moves_along(best.held, nats_per_query),
+            log_likelihood=best.log,
+            jumps=best.log - best.held,
+            tempering=spacing.detrended if slow else like.tempering,
+            separation=best.separation,
+            means=means,
+            values=best.values,
+            **{name: nn.Parameter(rate.to(self.enter_logit)) for name, rate in learned.items()},
+        )
 
     def _fitted(
         self, samples: Sequence[FittedPart], ranks: RankTable, start: Sequence[float], moved: float
-    ) -> Fit:
+    ) -> Found:
         """Expectation-maximisation from a start of the moves, which is their prior; `moved` queries move."""
         z = samples[0].std.z
         prior, separation = z.new_tensor(start), self.first_separation
@@ -435,7 +445,7 @@ class PlaceSmoother(SequenceModel):
         jump, leave, _ = self.rate_prior
         rare = rates._replace(jump=prior.new_tensor(jump), leave=prior.new_tensor(leave))
         nats = (self._nats(samples, table.values, separation, one) for one in (rates, rare))
-        return Fit(rates, separation, table.values, *nats)
+        return Found(rates, separation, table.values, *nats)
 
     def _nats(self, samples: Sequence[FittedPart], values: Tensor, separation: float, rates: Rates) -> float:
         """By how much the model beats being off the map."""

@@ -105,8 +105,8 @@ def test_pairs_have_red_frames_where_one_image_is_wrong():
 
 def test_where_a_drive_answers_its_wrong_single_images_are_shown():
     single, truth = answered([0, 5, 2, 3, 0, 5], [0.9, 0.8, 0.7, 0.6, 0.5, 0.4])
-    drive = replace(single, index=torch.arange(6))
-    run = run_on_frames(drive, truth, judged=single, smoother=PlaceSmoother())
+    drive = replace(single, index=torch.arange(6), smoother=PlaceSmoother())
+    run = run_on_frames(drive, truth, judged=single)
     picture = draw_pairs(run)["pairs"]
     assert [spines(row)[0] for row in picture.plot[1]] == [plots.WRONG] * 2 + [plots.RIGHT] * 4
     assert "Of 6 answers by one image 2 are wrong. Red" in picture.caption
@@ -114,7 +114,7 @@ def test_where_a_drive_answers_its_wrong_single_images_are_shown():
     assert list(zip(*crosses.get_data(), strict=True)) == [(1, 5), (4, 0)]
     assert crosses.get_label() == "2 wrong by one image"
     assert to_hex(crosses.get_color()) == plots.WRONG
-    assert not crosses_of(run._replace(smoother=None))
+    assert not crosses_of(run._replace(match=replace(drive, smoother=None)))
 
 
 def drawn_coverage(run):

@@ -177,9 +177,8 @@ def test_kept_lengths_are_told_by_the_file(tmp_path):
     model = DejaVu.load(tmp_path / "map.safetensors")
     assert model.descriptor.keeps_lengths
     assert torch.equal(model.localize(ranges()).index, torch.arange(256))
-    smoother = PlaceSmoother()
-    model.localize(ranges(), sequence=smoother)
-    assert smoother.removed == 0.5  # else nothing but inner products would be left of distances
+    match = model.localize(ranges(), sequence=PlaceSmoother())
+    assert match.smoother.removed == 0.5  # else nothing but inner products would be left of distances
     model.learn(torch.randn(60, 12))  # which a file settles
     assert model.descriptor.keeps_lengths
 

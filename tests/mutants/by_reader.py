@@ -276,8 +276,8 @@ MUTANTS = [
     Mutant(
         "A match on a map of shuffled frames (the null) tells the frame that is stored at the place.",
         "dejavu_torch/recognition/scorer.py",
-        "self.null, self.least = order.argsort(),",
-        "self.null, self.least = order,",
+        "self.place = order.argsort()",
+        "self.place = order",
         (
             "tests/evaluation/test_controls.py::test_convention_8_a_match_of_the_null_names_the_frame_that_is_stored",
         ),

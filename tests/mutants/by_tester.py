@@ -697,9 +697,9 @@ MUTANTS = [
     ),
     Mutant(
         "Where lengths count, half of each place's mean score stays.",
-        "dejavu_torch/recognition/localizer.py",
-        "smoother.map_links, smoother.removed = scorer.links, matching.removed",
-        "smoother.map_links = scorer.links",
+        "dejavu_torch/model.py",
+        "sequence = sequence.having(removed=REMOVED)",
+        "pass",
         ("tests/features/test_whitening.py::-k told_by_the_file",),
     ),
     Mutant(
@@ -719,7 +719,7 @@ MUTANTS = [
     Mutant(
         "Queries are a drive only if single images find the map.",
         "dejavu_torch/recognition/drive.py",
-        "known.is_drive &= known.singly.stands_out",
+        "is_drive &= found.stands_out",
         "pass",
         ("tests/recognition/test_taken.py::-k mirrored_queries_find",),
     ),
@@ -733,8 +733,8 @@ MUTANTS = [
     Mutant(
         "A coarse map is asked by motion alone.",
         "dejavu_torch/recognition/scorer.py",
-        "(self._mirrored, 0.0) if kept >= FAITHFUL else (None, ALONE)",
-        "(self._mirrored, 0.0)",
+        "self.fidelity is not None and self.fidelity >= FAITHFUL else None",
+        "self.fidelity is not None else None",
         ("tests/recognition/test_taken.py::-k coarse_map",),
     ),
     Mutant(
@@ -761,8 +761,8 @@ MUTANTS = [
     Mutant(
         "Changes far slower than the noise of the queries make none say less.",
         "dejavu_torch/recognition/smoother.py",
-        "self.tempering = spacing.detrended",
-        "self.tempering = self.tempering",
+        "tempering=spacing.detrended if slow else like.tempering",
+        "tempering=like.tempering",
         ("tests/recognition/test_smoother.py::-k that_are_slow",),
     ),
     Mutant(
@@ -782,8 +782,8 @@ MUTANTS = [
     Mutant(
         "A drive with few sure frames teaches nothing.",
         "dejavu_torch/teaching.py",
-        "if few or not smoother.is_drive else places",
-        "if not smoother.is_drive else places",
+        "if few or not match.is_drive else places",
+        "if not match.is_drive else places",
         ("tests/test_teaching.py::-k another_route_nowhere",),
     ),
     Mutant(
@@ -978,8 +978,8 @@ MUTANTS = [
     Mutant(
         "A flight is a flight over an area only if it explains its images.",
         "dejavu_torch/recognition/flight.py",
-        "smoother.is_drive = moves_along(swept.log, smoother.nats_per_query)",
-        "smoother.is_drive = True",
+        "is_drive=moves_along(swept.log, nats_per_query)",
+        "is_drive=True",
         ("tests/test_area.py::-k flight_is_found",),
     ),
     Mutant(

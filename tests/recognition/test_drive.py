@@ -37,7 +37,9 @@ def by_rows(rows, descriptors, places=80):
 def test_an_answer_has_the_most_mass_around_it():
     scores, smoother = shown(80, [*range(5, 75), *range(74, 40, -1)]), PlaceSmoother(within=3)
     match = localized(scores, smoother, platt=PLATT)
-    assert smoother.is_drive
+    assert match.is_drive
+    assert smoother.log_likelihood is None  # it stays as it was
+    smoother = match.smoother
     posterior = smoother.posterior(scores, noise(len(scores), 16, seed=8))[:, :-1]
     ranked = smoother(scores, noise(len(scores), 16, seed=8))
     answer, own = ranked.argmin(1), scores.gather(1, ranked.argmin(1)[:, None])[:, 0]
@@ -73,7 +75,7 @@ def test_candidates_are_apart_and_the_first_is_the_answer():
 def test_what_is_no_drive_is_answered_by_single_queries():
     scores, smoother, platt = 5 + noise(80, 100), PlaceSmoother(within=5), Platt(10.0, 14.0)
     match, alone = localized(scores, smoother, platt=platt), localized(scores, PlaceSmoother(within=5))
-    assert not smoother.is_drive
+    assert not match.is_drive
     assert torch.equal(match.index[:, 0], scores.argmin(1))
     assert torch.equal(match.score[:, 0], scores.amin(1))
     assert alone.probability is not None
@@ -148,14 +150,13 @@ def test_drives_are_matched_together_as_each_by_itself():
         ]
 
     together, alone = asked(), asked()
-    for one, found, expected in zip(
-        together, localize_drives(together), map(localize_drive, alone), strict=True
-    ):
+    matches = localize_drives(together)
+    for found, expected in zip(matches, map(localize_drive, alone), strict=True):
         assert torch.equal(found.index, expected.index)
         for name, column in expected.columns.items():
             assert torch.allclose(found.columns[name], column, rtol=1e-4, equal_nan=True), name
-        assert one.smoother.links in ((), links)
-    assert [one.smoother.is_drive for one in together] == [True, True, False, True, True, True]
+        assert found.smoother.links == expected.smoother.links
+    assert [one.is_drive for one in matches] == [True, True, False, True, True, True]
 
 
 @pytest.mark.parametrize("kept", [0, 2**26])
@@ -182,9 +183,9 @@ def test_a_threshold_is_of_a_probability_for_what_is_no_drive_too():
     route, other = noise(80, 12, seed=3).cumsum(0), noise(60, 12, seed=4)
     model = DejaVu(None, "none").learn(route)
     for threshold in (math.log(2), 1e-3):
-        smoother = PlaceSmoother(threshold=threshold)
-        match = model.localize(other, sequence=smoother)
-        assert not smoother.is_drive
+        match = model.localize(other, sequence=PlaceSmoother(threshold=threshold))
+        assert match.smoother is not None
+        assert not match.is_drive
         assert match.probability is not None
         assert torch.equal(match.accepted, match.probability >= math.exp(-threshold))
         assert not match.accepted.any()
@@ -193,9 +194,9 @@ def test_a_threshold_is_of_a_probability_for_what_is_no_drive_too():
 def test_frames_that_are_no_drive_are_localized_as_if_in_no_order():
     features = noise(80, 12, seed=3).cumsum(0)
     model = DejaVu(None, "none").learn(features)
-    other, smoother = noise(60, 12, seed=4) + 5, PlaceSmoother()
-    match = model.localize(other, sequence=smoother)
-    assert not smoother.is_drive
+    other = noise(60, 12, seed=4) + 5
+    match = model.localize(other, sequence=PlaceSmoother())
+    assert not match.is_drive
     assert torch.equal(match.index, model.localize(other, sequence=None, centre=True).index)
     assert not torch.equal(match.index, model.localize(other, sequence=None, centre=False).index)
 

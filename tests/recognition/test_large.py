@@ -17,7 +17,7 @@ from dejavu_torch.recognition import drive as driving
 from dejavu_torch.recognition import large
 from dejavu_torch.recognition.drive import DriveQuery, localize_drive
 from dejavu_torch.recognition.large import LargeDrive, is_large
-from dejavu_torch.recognition.localizer import Localizer, Matching
+from dejavu_torch.recognition.localizer import Matching, answer
 from dejavu_torch.recognition.motion import Motion, Rates
 from dejavu_torch.recognition.scorer import OfMap, OfRows
 from dejavu_torch.recognition.smoother import PlaceSmoother
@@ -48,12 +48,10 @@ def both(scores, monkeypatch, starts=(0,), **settings):
     queries = noise(len(scores), 16, seed=8)
     for coarse in (False, True):
         monkeypatch.setattr(driving, "is_large", lambda *_, answer=coarse: answer)
-        smoother = PlaceSmoother(within=3)
         scorer = InBlocks(scores.__getitem__, queries, layout)
-        match = localize_drive(DriveQuery(scorer, smoother, radius=4, **settings))  # type: ignore[arg-type]
-        found.append((match, smoother))
-    (one, first), (two, second) = found
-    return one, two, first, second
+        match = localize_drive(DriveQuery(scorer, PlaceSmoother(within=3), radius=4, **settings))  # type: ignore[arg-type]
+        found.append(match)
+    return found
 
 
 PATHS = {
@@ -71,9 +69,9 @@ def test_answers_are_those_of_all_places(name, monkeypatch):
     path = torch.tensor(PATHS[name])
     monkeypatch.setattr(large, "WINDOW", 120)
     monkeypatch.setattr(large, "MARGIN", 40)
-    one, two, dense, coarse = both(shown(400, PATHS[name]), monkeypatch)
-    assert dense.is_drive
-    assert coarse.is_drive
+    one, two = both(shown(400, PATHS[name]), monkeypatch)
+    assert one.is_drive
+    assert two.is_drive
     on = path >= 0
     right = [((match.index[:, 0] - path).abs() <= 3)[on].double().mean() for match in (one, two)]
     assert right[1] > 0.95
@@ -137,8 +135,8 @@ def test_scores_of_windows_are_those_that_were_given(monkeypatch):
 
 def test_another_route_is_answered_by_single_queries(monkeypatch):
     scores = shown(400, [-1] * 200)
-    _, two, _, coarse = both(scores, monkeypatch)
-    assert not coarse.is_drive
+    _, two = both(scores, monkeypatch)
+    assert not two.is_drive
     assert torch.equal(two.index[:, 0], scores.argmin(1))
     assert torch.equal(two.score[:, 0], scores.amin(1))
     assert two.probability is not None
@@ -151,8 +149,8 @@ def test_queries_and_places_without_scores(monkeypatch):
     scores[60] = 1.0
     scores[90] = math.inf
     scores[:, 100:110] = math.inf
-    one, two, _, coarse = both(scores, monkeypatch)
-    assert coarse.is_drive
+    one, two = both(scores, monkeypatch)
+    assert two.is_drive
     assert (one.index - two.index).abs().max() <= 1
     assert two.index[[30, 90], 0].tolist() == [-1, -1]
     assert two.index[60, 0] == 110 or abs(int(two.index[60, 0]) - 110) <= 4
@@ -196,9 +194,8 @@ def test_few_bytes_are_placed_as_by_all_places(room, monkeypatch):
     truth, found = torch.arange(500, 500 + queries), []
     for coarse in (False, True):
         monkeypatch.setattr(driving, "is_large", lambda *_, answer=coarse: answer)
-        smoother = PlaceSmoother(within=5)
-        match = Localizer(learned, Matching(smoother, radius=5)).drive(OfMap(learned, asked), smoother)
-        assert smoother.is_drive
+        match = answer(OfMap(learned, asked), Matching(PlaceSmoother(within=5), radius=5))
+        assert match.is_drive
         found.append(float(((match.index - truth).abs() <= 5).double().mean()))
     assert found[1] > 0.95
     assert found[1] >= found[0] - 0.01

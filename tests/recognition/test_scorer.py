@@ -7,9 +7,9 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dejavu_torch import DejaVu, Layout, PlaceFilter, PlaceSmoother, SpectralMapper
+from dejavu_torch import DejaVu, Layout, PlaceFilter, SpectralMapper
 from dejavu_torch.maps.distance import phase_distances
-from dejavu_torch.recognition.localizer import Matching, drive_query, match_scores
+from dejavu_torch.recognition.localizer import Matching, answer
 from dejavu_torch.recognition.scorer import BestOf, Earlier, OfMap, OfRows, OfStored, Reordered, Wrapped
 
 
@@ -45,7 +45,7 @@ def test_stored_frames_answer_for_their_neighbours_in_each_direction(k, rows, co
     stored, nearest = layout.strided(k)
     expected = phase_distances(queries, frames, "l1")[:, stored[nearest]]
     torch.testing.assert_close(scorer.rows(every), expected)
-    found = match_scores(scorer).index
+    found = answer(scorer).index
     assert torch.isin(found, stored).all()
     assert torch.equal(found, stored[phase_distances(queries, frames[stored], "l1").argmin(1)])
 
@@ -78,7 +78,7 @@ def test_frames_that_are_stored_keep_their_numbers_in_another_order():
     frames = noise(30, 4)
     scorer = Reordered(OfStored(frames[order], noise(50, 4, seed=1), 4), order)
     assert sorted(scorer.stored.tolist()) == sorted(order[::4].tolist())
-    assert torch.isin(match_scores(scorer).index, order[::4]).all()
+    assert torch.isin(answer(scorer).index, order[::4]).all()
 
 
 @pytest.mark.parametrize(
@@ -99,14 +99,6 @@ def test_a_wrapper_that_changes_nothing_changes_no_answer(place_map, matching):
     assert (plain.heading is None) == (wrapped.heading is None)
     if plain.heading is not None:
         assert (plain.heading == wrapped.heading).double().mean() > 0.9
-
-
-def test_a_drive_has_the_share_of_the_mean_that_its_scores_need():
-    scorer, smoother = OfRows(noise(9, 5).__getitem__, noise(9, 3), Layout(5)), PlaceSmoother()
-    smoother.removed = 0.25
-    assert drive_query(scorer, smoother).smoother.removed == 0.25
-    assert drive_query(scorer, smoother, removed=0.5).smoother.removed == 0.5
-    assert smoother.removed == 0.25
 
 
 def test_only_earlier_places_answer_and_blank_queries_find_none():

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from dejavu_torch import DejaVu, PlaceFilter, SequenceMatcher, SpectralMapper
 from dejavu_torch.maps.place_map import PlaceMap
-from dejavu_torch.recognition import localizer
+from dejavu_torch.recognition import scorer
 from dejavu_torch.recognition import search as searching
 from dejavu_torch.recognition.calibration import Calibration, Platt, confidence_of
 from dejavu_torch.recognition.localizer import Localizer, Matching
@@ -113,7 +113,7 @@ def test_candidates_are_those_of_all_scores(places, k, radius, values, seed):
 
 @pytest.mark.parametrize("settings", [{"chunk": 50}, {"chunk": 50, "metric": "l2"}], ids=str)
 def test_a_calibrated_map_finds_the_same_without_all_scores(settings, monkeypatch):
-    monkeypatch.setattr(localizer, "SHORT", 0)
+    monkeypatch.setattr(scorer, "SHORT", 0)
     route = walk(600)
     model = DejaVu(whitening="none", mapper=SpectralMapper(6.0, **settings)).learn(route)
     platt = Platt(4.0, 1.0)
@@ -134,13 +134,13 @@ def test_many_of_the_best_are_taken_from_all_scores(monkeypatch):
     route = Scored(torch.rand(21, 2000), 1000)
     assert torch.equal(Localizer(route)(rows_of(route)).index, route.rows.argmin(1))
     assert route.batches == []
-    monkeypatch.setattr(localizer, "SHORT", 1999)
+    monkeypatch.setattr(scorer, "SHORT", 1999)
     for k, radius, batches in ((3, 5, [21]), (6, 100, [])):
         found = Localizer(route, Matching(k=k, radius=radius))(rows_of(route))
         assert torch.equal(found.index, best_candidates(route.rows, k, radius).index)
         assert route.batches == batches
         route.batches.clear()
-    monkeypatch.setattr(localizer, "SCORES_AT_ONCE", 8 * localizer.PER_BEST * (2 * (2 * 5 + 1) + 1))
+    monkeypatch.setattr(scorer.Scorer, "at_once", 8 * scorer.PER_BEST * (2 * (2 * 5 + 1) + 1))
     assert Localizer(route, Matching(k=3, radius=5))(rows_of(route)).index.shape == (21, 3)
     assert route.batches == [8, 8, 5]
     monkeypatch.setattr(searching, "SCORES_AT_ONCE", 4 * 1000)

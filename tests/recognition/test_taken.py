@@ -49,9 +49,9 @@ def model():
 
 
 def asked(model, queries):
-    """A smoother that was asked where the queries are, and its match."""
-    smoother = PlaceSmoother()
-    return smoother, model.localize_descriptors(queries, model.matching(smoother))
+    """A smoother that was fitted to the queries, and its match."""
+    match = model.localize_descriptors(queries, model.matching(PlaceSmoother()))
+    return match.smoother, match
 
 
 def test_mirrored_queries_are_as_alike_as_they_were_and_have_the_same_mean():
@@ -100,9 +100,9 @@ def test_single_images_that_find_the_map_plainly_need_no_motion(model):
     draw = torch.Generator().manual_seed(4)
     own = seen_again(walk(400, 0)[torch.randperm(400, generator=draw)[:100]], 5)
     mixed = torch.stack([own, walk(100, 9)[torch.randperm(100, generator=draw)]], 1).flatten(0, 1)
-    smoother = PlaceSmoother()
-    match = model.localize_descriptors(mixed, model.matching(smoother)._replace(platt=platt))
-    assert not smoother.is_drive
+    match = model.localize_descriptors(mixed, model.matching(PlaceSmoother())._replace(platt=platt))
+    smoother = match.smoother
+    assert not match.is_drive
     assert smoother.singly is not None
     assert smoother.singly.enough
     single = model.localize_descriptors(mixed, model.matching()._replace(platt=platt))
@@ -168,14 +168,13 @@ def test_other_ground_is_no_drive_although_its_frames_are_in_order(model):
 def test_a_drive_whose_mirrored_queries_find_the_map_as_well_is_none(model):
     own = seen_again(walk(400, 0)[50:350], 5)
     for mirrored, drives in (None, True), (lambda scorer: lambda queries, seed: scorer.rows(queries), False):
-        smoother = PlaceSmoother()
 
         def asks(scorer, mirrored=mirrored):
             null = None if mirrored is None else mirrored(scorer)
             return OfRows(scorer.rows, scorer.descriptors, scorer.layout, null)
 
-        model.localize_descriptors(own, model.matching(smoother), asks)
-        assert smoother.is_drive is drives
+        match = model.localize_descriptors(own, model.matching(PlaceSmoother()), asks)
+        assert match.is_drive is drives
 
 
 def test_a_part_over_the_map_is_a_drive(model):
