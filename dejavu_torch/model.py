@@ -472,7 +472,7 @@ class DejaVu(nn.Module):
         return Localizer(self.map, matching, self._searcher(matching))
 
     def _searcher(self, matching: Matching) -> Searcher | None:
-        """What finds the best places; None if all scores are needed. Refuses a way that is none of the map."""
+        """What finds the best places; None if all scores are needed. Refuses ways that do not fit."""
         require_map(self)
         check_search(matching.search)
         if matching.sequence is not None:

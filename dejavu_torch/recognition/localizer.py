@@ -178,10 +178,8 @@ class Localizer:
 
     def _turned(self, match: Match, scorer: Scorer, queries: Tensor) -> Match:
         """The match of queries with its headings, if there are copies of them, and these answer now."""
-        sequence = self.matching.sequence
-        return (
-            match if sequence is not None and sequence.lag else headed(match, scorer, queries, self.matching)
-        )
+        late = self.matching.sequence is not None and self.matching.sequence.lag
+        return match if late else headed(match, scorer, queries, self.matching)
 
     def _without_blank(self, match: Match, scorer: Scorer) -> Match:
         """The match, in which blank frames find nothing by themselves."""
