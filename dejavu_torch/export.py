@@ -26,7 +26,6 @@ from dejavu_torch.model import DejaVu, require_map
 from dejavu_torch.recognition.calibration import POWER
 from dejavu_torch.recognition.calibration import TOLERANCE as BEYOND
 from dejavu_torch.recognition.centring import running_mean
-from dejavu_torch.recognition.sequence import SequenceMatcher
 from dejavu_torch.text import one_line
 from dejavu_torch.types import Facts, InputError, SequenceModel, expect
 from dejavu_torch.version import __version__
@@ -250,7 +249,7 @@ def _facts(model: DejaVu, sequence: SequenceModel | None, centre: bool) -> Facts
         state = list(sequence.start(places, fixed=True).shape)
         facts["inputs"] = {name: [1, *sizes], "state": state}
         facts["outputs"] = {"scores": [1, places], "next_state": state}
-        facts["first_state"] = "nan" if isinstance(sequence, SequenceMatcher) else "0"
+        facts["first_state"] = "nan" if sequence.answers == "sequence" else "0"
         facts["sequence"] = str(sequence)
         threshold = sequence.threshold_of(model.threshold)
         threshold = sequence.likely if threshold is None else threshold  # without a calibration

@@ -7,7 +7,7 @@ import inspect
 import logging
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -35,6 +35,7 @@ from dejavu_torch.places.layout import ROUTE, Layout
 from dejavu_torch.recognition.centring import PRIOR, centred, set_apart
 from dejavu_torch.recognition.coarse import searcher
 from dejavu_torch.recognition.localizer import SINGLE, Localizer, Matching, answer
+from dejavu_torch.recognition.querying import QUERYING, Querying
 from dejavu_torch.recognition.scorer import OfMap, Scorer
 from dejavu_torch.recognition.search import Scan, Search, Searcher, check_search
 from dejavu_torch.recognition.select import HIGHEST, PROBABLE, Acceptance, check_candidates
@@ -409,9 +410,7 @@ class DejaVu(nn.Module):
         Raises:
             InputError: no map, no frames, NaN, or features of another dimension than the map's.
         """
-        return Match.joined(
-            self.matches(queries, progress, sequence, search, centre=centre, headings=headings)
-        )
+        return Match.joined(self.matches(queries, _querying(sequence, centre, headings), progress, search))
 
     def localize_descriptors(
         self,
@@ -489,23 +488,20 @@ class DejaVu(nn.Module):
     def matches(
         self,
         queries: Source,
+        querying: Querying = QUERYING,
         progress: bool = False,
-        sequence: SequenceModel | Literal["auto"] | None = "auto",
         search: Search | None = None,
-        k: int | None = None,
         apart: int = 5,
-        centre: bool | None = None,
-        headings: int = 1,
     ) -> Iterator[Match]:
-        """As `localize`, or with k as `candidates`, one batch of queries at a time, in constant memory; with
-        a smoother, centred queries or several headings, after the descriptors of all queries."""
+        """As `localize`, or with `top` as `candidates`, one batch of queries at a time, in constant memory;
+        with a smoother, centred queries or several headings, after the descriptors of all queries."""
         require_map(self)
-        if k is not None:
-            check_candidates(k, apart, self.map.places)
+        if querying.top is not None:
+            check_candidates(querying.top, apart, self.map.places)
         queries = self.at_map_size(as_traverse(queries), self.frame_shape or ())
-        if isinstance(sequence, str):
-            sequence = PlaceSmoother() if queries.ordered else None
-        matching = self.matching(sequence, search)._replace(k=k, radius=apart, copies=headings)
+        sequence, headings = querying.matcher(ordered=queries.ordered), querying.headings
+        assert not isinstance(sequence, str)
+        matching = self.matching(sequence, search)._replace(k=querying.top, radius=apart, copies=headings)
         localizer = self.localizer(matching)
         if sequence is not None:
             sequence.check(len(queries), self.map.places)
@@ -520,14 +516,14 @@ class DejaVu(nn.Module):
 
         turned = isinstance(queries, Turned)
         whole = sequence is not None and sequence.whole
-        if not (whole or (centre and not turned) or headings > 1):
+        if not (whole or (querying.centres(False) and not turned) or headings > 1):
             batches = self.descriptor.batches(queries, progress, "localizing", on_first)
             yield from map(localizer, (set_apart(self.map, rows) if turned else rows for rows in batches))
             return
         descriptors = self.descriptor.all_of(queries, progress, on_first)
         if turned:
             descriptors = set_apart(self.map, descriptors)
-        elif self.centres(len(descriptors)) if centre is None else centre:
+        elif querying.centres(self.centres(len(descriptors))):
             descriptors = centred(self.map, descriptors)
         yield self.localize_descriptors(descriptors, matching, progress=progress)
 
@@ -563,7 +559,8 @@ class DejaVu(nn.Module):
             >>> DejaVu().learn(wave).candidates(wave[20:22], k=3).index[:, 0]
             tensor([20, 21])
         """
-        return Match.joined(self.matches(queries, False, sequence, search, k, apart, centre, headings))
+        querying = replace(_querying(sequence, centre, headings), top=k)
+        return Match.joined(self.matches(queries, querying, False, search, apart))
 
     def matching(self, sequence: SequenceModel | None = None, search: Search | None = None) -> Matching:
         """How queries are matched, with probabilities if the map is calibrated for it. Raises InputError if a
@@ -635,6 +632,14 @@ class DejaVu(nn.Module):
         except KeyError as error:
             raise InputError(f"the model's state has no {error}; expected one of this version") from error
         self.searcher = None  # of the map before
+
+
+def _querying(
+    sequence: SequenceModel | Literal["auto"] | None, centre: bool | None, headings: int
+) -> Querying:
+    """The options of `localize` as one object."""
+    mean: Literal["mean", "none"] | None = None if centre is None else "mean" if centre else "none"
+    return Querying(centre=mean, headings=headings).by(sequence)
 
 
 def _state_of(model: DejaVu, place_map: PlaceMap, traverse: Traverse | None) -> model_file.ModelState:

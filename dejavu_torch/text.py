@@ -45,6 +45,13 @@ def expect(fits: object, to_be: object, seen: object = "", /, **given: object) -
         raise InputError(f"{seen or ' and '.join(map(' is '.join, pairs))}; expected {to_be}")
 
 
+def refuse_with(option: str, **others: object) -> None:
+    """Refuse an option if one of the others, which exclude it, is given."""
+    for name, value in others.items():
+        other = f"--{name}" if value is True else f"--{name} {value}"
+        expect(not value, "one of them", f"{option} and {other}")
+
+
 def plain_number(number: object) -> int | float:
     """A number as in JSON, whole if it is."""
     value = float(number)  # type: ignore[arg-type]

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from functools import cached_property
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, SupportsIndex, TypeAlias
+from typing import Any, Literal, NamedTuple, SupportsIndex, TypeAlias
 
 import torch
 from torch import Tensor, nn
@@ -22,9 +22,6 @@ from dejavu_torch.places.layout import ROUTE, Layout
 from dejavu_torch.text import InputError as InputError
 from dejavu_torch.text import expect as expect
 from dejavu_torch.text import printable
-
-if TYPE_CHECKING:
-    from dejavu_torch.recognition.smoother import PlaceSmoother
 
 BATCH_NUMBERS = 2**26  # values in a batch of more than one frame: 256 MB
 BATCH_SIZE = 64  # frames read at a time by default
@@ -281,7 +278,7 @@ class Match:
     confidence: Tensor | None = None
     heading: Tensor | None = None
     sequences: Mapping[Together, Match] = field(default_factory=dict)
-    smoother: PlaceSmoother | None = None
+    smoother: SequenceModel | None = None
 
     @property
     def columns(self) -> dict[str, Tensor]:
@@ -353,9 +350,10 @@ class SequenceModel(nn.Module, ABC):
         answers: what reports call its answers: "sequence", "filter" or "drive". A map is calibrated for
             single queries and for a filter.
         whole: whether it needs all queries, as of a drive.
+        is_drive: whether the queries that it was fitted to, if any, are a drive of the map.
         length, speeds: queries that it sums over, and places that pass from one to the next, if it has these.
         lag: queries by which its answers come later. Parameters and buffers need other names
-            than these five.
+            than these six.
 
     Convention: each score is for the place of its own query. All but those of a `whole` drive are causal, and
         their memory does not grow with the queries. Matching changes none: what it has to know beside its
@@ -365,6 +363,7 @@ class SequenceModel(nn.Module, ABC):
     likely: float | None = None
     answers: Literal["sequence", "filter", "drive"] = "sequence"
     whole: bool = False
+    is_drive: bool = True
     length: int = 1
     speeds: tuple[float, ...] = ()
     lag: int = 0
@@ -394,6 +393,10 @@ class SequenceModel(nn.Module, ABC):
         expected = "single images (--match single), a PlaceFilter or a PlaceSmoother"
         layout.expect_route(expected, f"{type(self).__name__}, and the map of an area")
         return self
+
+    def settled(self) -> Facts:
+        """What it learned from the queries that it was fitted to, for a report."""
+        return {}
 
     def changed(self, **attributes: object) -> Self:
         """A copy with other attributes, which shares all parameters and buffers but those that are given."""

@@ -11,7 +11,9 @@ import torch
 from dejavu_torch import DejaVu, Layout, PlaceFilter, PlaceSmoother, SpectralMapper, compare
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.evaluation.matches import read_matches, write_matches
+from dejavu_torch.evaluation.options import Reporting
 from dejavu_torch.places.layout import KINDS
+from dejavu_torch.recognition.querying import Querying
 from dejavu_torch.recognition.scorer import Earlier, OfMap, Reordered, Scorer, Wrapped
 from dejavu_torch.types import InputError, SequenceModel
 
@@ -47,11 +49,11 @@ class Doubled(SequenceModel):
 
 
 def test_a_way(tmp_path):
-    found = compare(waves(0), waves(1), "0", model(), sequence=Doubled())
+    found = compare(waves(0), waves(1), "0", model(), querying=Querying(match=Doubled()))
     report = found.report.as_json()
     assert report["recall_at_1"] > 0.95
     assert report["answers"] == "sequence"
-    single = compare(waves(0), waves(1), "0", model(), sequence=None).report
+    single = compare(waves(0), waves(1), "0", model(), querying=Querying(match="single")).report
     assert report["recall_at_1"] >= single.as_json()["recall_at_1"]
     one_by_one = model().learn(waves(0)).localize(waves(1), sequence=Doubled())
     assert torch.equal(one_by_one.index, found.run.match.index)
@@ -76,7 +78,7 @@ def test_a_layout(tmp_path, monkeypatch):
     monkeypatch.setitem(KINDS, "Ring", Ring)  # that files may name
     square, seen = waves(0), waves(1)
     square.layout = Ring(120)
-    found = compare(square, seen, "0", model(), top=3, tolerance=5, sequence=None)
+    found = compare(square, seen, "0", model(), tolerance=5, querying=Querying(top=3, match="single"))
     assert found.report.as_json()["recall_at_1"] > 0.95
     model().learn(square).save(tmp_path / "map.safetensors")
     loaded = DejaVu.load(tmp_path / "map.safetensors")
@@ -106,7 +108,14 @@ def test_a_baseline():
     reference, query = waves(0), waves(1)
     bits = Signs(reference, query)
     contenders = {"signs": ("signs", 120 * 2, bits)}
-    found = compare(reference, query, "0", model(), contenders=contenders, ordered=True, drives="all")
+    found = compare(
+        reference,
+        query,
+        "0",
+        model(),
+        querying=Querying(ordered=True),
+        reporting=Reporting(contenders=contenders, drives="all"),
+    )
     report = found.report.as_json()["signs"]
     assert report["recall_at_1"] > 0.8
     assert report["bytes"] == 240
@@ -131,7 +140,14 @@ def test_a_baseline_of_other_queries_is_refused_before_anything_is_learned(key, 
     reference, query, learned = waves(0), waves(1), model()
     scorer = Signs(reference, ArrayTraverse(query[:queries]))
     with pytest.raises(InputError, match=line):
-        compare(reference, query, truth, learned, contenders={key: ("signs", 240, scorer)}, ordered=True)
+        compare(
+            reference,
+            query,
+            truth,
+            learned,
+            querying=Querying(ordered=True),
+            reporting=Reporting(contenders={key: ("signs", 240, scorer)}),
+        )
     assert learned.map.places == 0
 
 

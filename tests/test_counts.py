@@ -18,9 +18,11 @@ from dejavu_torch import (
     compare,
     open_source,
 )
+from dejavu_torch.evaluation.options import Reporting
 from dejavu_torch.maps.spectral_map import SpectralMap
 from dejavu_torch.recognition.motion import Motion
 from dejavu_torch.recognition.plane import PlaneMotion
+from dejavu_torch.recognition.querying import Querying
 from dejavu_torch.recognition.samples import RowSearch
 
 SLACK = 0.1  # rounds of learning how a camera moves end a little earlier or later on another processor
@@ -66,7 +68,12 @@ def localized(sequence):
 
 def compared(reference, query, truth):
     return lambda: compare(
-        open_source(reference), open_source(query), truth, model(), ordered=True, drives="all"
+        open_source(reference),
+        open_source(query),
+        truth,
+        model(),
+        querying=Querying(ordered=True),
+        reporting=Reporting(drives="all"),
     )
 
 

@@ -41,6 +41,7 @@ from dejavu_torch.features.joined import Joined
 from dejavu_torch.features.pixels import PatchPixels
 from dejavu_torch.features.views import LabelledFrames, augmented_route
 from dejavu_torch.recognition import coarse
+from dejavu_torch.recognition.querying import Querying
 from dejavu_torch.recognition.samples import RowSearch
 from dejavu_torch.recognition.select import best_candidates, best_match
 
@@ -221,7 +222,7 @@ def test_a_comparison_runs_on_a_gpu(mapper, device, visits, tmp_path, monkeypatc
     for drawn in ("draw_pictures", "draw_compared", "draw_reliability"):  # from a model on the CPU
         monkeypatch.setattr(f"dejavu_torch.evaluation.compare.{drawn}", lambda *_: {})
     chosen = LEARNED["templates"] if mapper == "templates" else SpectralMapper()
-    compared = compare(*visits, "0", small(mapper=chosen).to(device), ordered=True, top=2)
+    compared = compare(*visits, "0", small(mapper=chosen).to(device), querying=Querying(ordered=True, top=2))
     assert compared.report.ours.scores is not None
     model, path = compared.run.model, tmp_path / "map.safetensors"
     model.to(device).save(path)

@@ -32,7 +32,9 @@ from dejavu_torch import (
 from dejavu_torch.data import GroundTruth
 from dejavu_torch.data.source import as_traverse
 from dejavu_torch.evaluation import judge
+from dejavu_torch.evaluation.options import Learning
 from dejavu_torch.features.cnn import SmallCNN
+from dejavu_torch.recognition.querying import Querying
 from dejavu_torch.training.metrics import PlaceRecognition
 from dejavu_torch.types import FrequencyLayer
 
@@ -288,7 +290,8 @@ def test_average_precision_is_that_of_scikit_learn():
 
 def test_a_comparison_takes_places_as_truth():
     route = "sim:aerial?frames=60&size=32"
-    settings = {"model": spectral(), "calibration": "none", "ordered": False}
+    unordered, uncalibrated = Querying(unordered=True), Learning(calibration="none")
+    settings = {"model": spectral(), "learning": uncalibrated, "querying": unordered}
     found = compare(route, route + "&traverse=1", torch.arange(60), **settings)
     expected = compare(route, route + "&traverse=1", "0", **settings)
     assert found.report.ours.scores == expected.report.ours.scores

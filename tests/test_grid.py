@@ -30,6 +30,7 @@ from dejavu_torch.data.grid import Grid
 from dejavu_torch.data.ground_truth import find_ground_truth
 from dejavu_torch.data.picture import PictureFile, read_picture
 from dejavu_torch.data.source import check_not_read
+from dejavu_torch.evaluation.options import Reporting
 from dejavu_torch.places.rectangles import Ground
 from dejavu_torch.resize import resize_frames
 from dejavu_torch.types import Coordinates
@@ -393,7 +394,9 @@ def test_a_flight_over_a_later_picture_needs_no_truth(tmp_path):
     here, there = coordinates_of([open_source(reference), flight], "pixels")
     assert here.shape[1] == there.shape[1] == 2
     # rivals and controls fly over the area, too
-    report = compare(reference, flight, model=model, tolerance=10, drives="all").report.as_json()
+    report = compare(
+        reference, flight, model=model, tolerance=10, reporting=Reporting(drives="all")
+    ).report.as_json()
     for rival in (report, report["uncompressed"], report["hog"]):
         for way in ("filter", "smoother"):
             assert rival["sequences"][way]["recall_at_1"] > 0.9

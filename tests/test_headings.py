@@ -19,10 +19,12 @@ from dejavu_torch.data.flight import Flight
 from dejavu_torch.data.grid import Grid
 from dejavu_torch.data.traverse import Chain, Part
 from dejavu_torch.data.turning import Turned, facing_north, turned_north
+from dejavu_torch.evaluation.options import Reporting
 from dejavu_torch.maps.spectral_map import SpectralMap
 from dejavu_torch.places.layout import Layout
 from dejavu_torch.recognition.centring import learn_turned, set_apart
 from dejavu_torch.recognition.localizer import Matching, answer
+from dejavu_torch.recognition.querying import Querying
 from dejavu_torch.recognition.scorer import OfRows
 from dejavu_torch.recognition.select import best_candidates
 
@@ -213,13 +215,13 @@ def test_what_cannot_be_turned_is_refused(model, ground, images):
     with refused("headings 4, and the array has ready features; expected images, which can be turned"):
         model.localize(rows, headings=4)
     with refused("loops 3 and headings 4; expected one of them"):
-        compare(ground, None, loops=3, headings=4)
+        compare(ground, None, querying=Querying(loops=3, headings=4))
     with refused("loops on the map of an area; expected a route"):
         model.loops(ground)
     with refused("loops on the map of an area; expected a route"):
-        compare(ground, None, loops=3)
+        compare(ground, None, querying=Querying(loops=3))
     with refused("a storage curve and headings 4; expected one of them"):
-        compare(ground, images, headings=4, storage_curve=True)
+        compare(ground, images, querying=Querying(headings=4), reporting=Reporting(storage_curve=True))
 
 
 def test_commands_try_headings(tmp_path, model, ground, images, capsys):

@@ -14,6 +14,7 @@ from helpers import refused
 from dejavu_torch import DejaVu, PlaceFilter, open_source
 from dejavu_torch.data.ground_truth import as_ground_truth, of_loops
 from dejavu_torch.evaluation.compare import compare
+from dejavu_torch.recognition.querying import Querying
 
 
 def twice(length=120):
@@ -104,9 +105,9 @@ def test_a_comparison_of_loops_asks_all_contenders_for_them(tmp_path, capsys):
     with refused("expected a second visit, or loops"):
         compare(twice(), None)
     with refused("without query"):
-        compare(twice(), twice(), loops=5)
+        compare(twice(), twice(), querying=Querying(loops=5))
     with refused("expected a smoother"):
-        compare(twice(), None, loops=5, sequence=PlaceFilter())
+        compare(twice(), None, querying=Querying(loops=5, match=PlaceFilter()))
 
 
 def test_real_drives_with_and_without_loops(data_dir):

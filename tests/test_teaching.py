@@ -20,6 +20,7 @@ from dejavu_torch import (
     open_source,
 )
 from dejavu_torch.data.arrays import ArrayTraverse
+from dejavu_torch.evaluation.options import Learning
 from dejavu_torch.export import export_onnx, run_session, session_of
 from dejavu_torch.features.views import LabelledFrames
 from dejavu_torch.features.whitening import LIGHT, VISIT, Visits
@@ -253,7 +254,9 @@ def test_a_report_and_the_command_tell_how_many_frames_teach(road, drive, tmp_pa
     assert second["probability"] == SURE
     run("learn", pair[0], *words, "--map", tmp_path / "m.safetensors")
     assert "frames of" in capsys.readouterr().out
-    plain = compare(road, ArrayTraverse(frames_of(2), "query"), "0", fresh(), calibration="none").report
+    plain = compare(
+        road, ArrayTraverse(frames_of(2), "query"), "0", fresh(), learning=Learning(calibration="none")
+    ).report
     assert "second" not in plain.facts
 
 

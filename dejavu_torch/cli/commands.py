@@ -25,6 +25,7 @@ from dejavu_torch.cli.device import device_of
 from dejavu_torch.data.output import check_output_file
 from dejavu_torch.data.source import check_not_read, open_source
 from dejavu_torch.data.traverse import chained, kept
+from dejavu_torch.evaluation.options import NO_CALIBRATION
 from dejavu_torch.features.joined import Joined
 from dejavu_torch.features.views import SAMPLE as SHORT
 from dejavu_torch.features.views import LabelledFrames
@@ -37,7 +38,8 @@ from dejavu_torch.model_file import REGISTRY, recipe_of, with_parts
 from dejavu_torch.motion.resampling import ResampledTraverse
 from dejavu_torch.recognition.calibration import Calibration
 from dejavu_torch.recognition.coarse import plan
-from dejavu_torch.text import printable
+from dejavu_torch.recognition.querying import Sequences
+from dejavu_torch.text import printable, refuse_with
 from dejavu_torch.types import InputError, Match, Traverse, expect
 
 if TYPE_CHECKING:
@@ -88,7 +90,8 @@ def run_learn(
         print_steps(traverse)
     visits = None if growing.average is None else growing.visits(model, traverse)
     learning.check_calibrated(model, visits.traverse if traverse is None else traverse)  # type: ignore[union-attr]
-    traverse, views, known = learning.with_views(model, traverse)
+    traverse, beside = learning.with_views(model, traverse)
+    views, known = beside.views, beside.visit
     if traverse is not None and not isinstance(traverse, ResampledTraverse):
         traverse = kept(traverse)
     places: Tensor | None = None  # that the traverse shows; None: all, from the first on
@@ -118,7 +121,7 @@ def run_learn(
             model.learn(traverse, True, views, checkpoint, map_tasks)
     if cluster is not None and append is None and model.map.places <= SHORT:
         print(f"--cluster {cluster} is not used for {model.map.places} frames, only for more than {SHORT}")
-    if learning.calibration != options.NO_CALIBRATION:
+    if learning.calibration != NO_CALIBRATION:
         growth.calibrate_if_possible(model, traverse, known, places, True)
     model.matching()
     model.save(map)
@@ -133,7 +136,7 @@ def run_export(
     map: Path,
     *,
     onnx: Path,
-    sequences: options.Sequences,
+    sequences: Sequences,
     centre: Literal["mean", "none"] = "none",
     threshold: float | None = None,
     features: nn.Module | None = None,
@@ -301,7 +304,7 @@ def check_cluster(cluster: str, device: str, mapper: Mapper | None = None) -> No
     """Refuse early what no cluster does, or not with this mapper."""
     from dejavu_torch.cluster import check_installed
 
-    options.refuse_with(f"--cluster {cluster}", device=device != "cpu" and device)
+    refuse_with(f"--cluster {cluster}", device=device != "cpu" and device)
     check_installed()
     seen = f"--cluster {cluster} encodes chunks, and {type(mapper).__name__} has none"
     expect(isinstance(mapper, SpectralMapper | None), "a spectral map", seen)

@@ -6,6 +6,7 @@ import threading
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 
 from torch import Tensor
@@ -28,8 +29,10 @@ from dejavu_torch.model import DejaVu
 from dejavu_torch.motion.ground_plane import check_corners
 from dejavu_torch.motion.resampling import source_of
 from dejavu_torch.recognition.calibration import TOLERANCE
+from dejavu_torch.recognition.querying import Querying
 from dejavu_torch.recognition.select import check_candidates
 from dejavu_torch.recognition.smoother import PlaceSmoother
+from dejavu_torch.text import refuse_with
 from dejavu_torch.types import InputError, Match, Traverse, expect
 
 NO_DRIVE = "the queries do not look like a drive on this map: each is matched by itself"
@@ -41,14 +44,10 @@ def run_localize(
     *,
     out: Path,
     acceptance: options.Acceptance,
-    top: int | None = None,
-    loops: int | None = None,
-    headings: int = 1,
     route: str | None = None,
     pairs: Path | None = None,
     corners: list[list[float]] | None = None,
-    sequences: options.Sequences,
-    ordering: options.Ordering,
+    querying: Querying,
     searching: options.Searching,
     cluster: str | None = None,
     skip_damaged: bool = False,
@@ -61,12 +60,6 @@ def run_localize(
         source: frames to find, as in `dejavu learn`
         out: csv of query,place,score,accepted[,probability],confidence[,heading][,rank][,route][,x,y],
             query_name,place_name
-        top: write this many places per query, no two within 5 of each other, each in a row with its rank;
-            only the first has a probability
-        loops: find where a drive returns to its own places, on a map learned from it; ignore this many frames
-            before each frame, and all after it
-        headings: on the map of an area, try this many headings of each image, evenly over 360 degrees, such
-            as 24, which takes 24 times as long
         route: find places of this route of a merged map alone
         pairs: also write lines `query_name place_name` for hloc and COLMAP, one per place
         corners: where this camera sees the patch of ground that the map's --velocity.corners describe
@@ -75,12 +68,13 @@ def run_localize(
     """
     device_of(loading.device)
     _check_written(out, pairs, map, source)
-    matcher = sequences.matcher(SUPPRESSION, acceptance.threshold)
-    ordered = ordering.of(matcher)
+    querying.check_loops(cluster=cluster)
+    matcher, top, loops = querying.matcher(SUPPRESSION, acceptance.threshold), querying.top, querying.loops
+    ordered = querying.order(matcher)
     acceptance.check(matcher)
     if cluster is not None:
         check_cluster(cluster, loading.device)
-        options.refuse_with(f"--cluster {cluster}", match=matcher not in (None, "auto") and sequences.way)
+        refuse_with(f"--cluster {cluster}", match=matcher not in (None, "auto") and querying.way)
         matcher = None
     model = loading.model(map, route)
     searching.of(model)
@@ -93,18 +87,19 @@ def run_localize(
     damaged: dict[int, str] | None = {} if skip_damaged else None
     query = _open_query(model, source, map if pairs else None, damaged)
     ordered = source_of(query).ordered if ordered is None else ordered
-    matcher = ordering.chosen(matcher, ordered, SUPPRESSION, acceptance.threshold)
-    chosen = model.matching(matcher).acceptance
-    smooths = isinstance(matcher, PlaceSmoother)
-    centre = (smooths or matcher is None) and ordering.centring(model, ordered, len(query))
+    if matcher == "auto":
+        matcher = querying.matcher(SUPPRESSION, acceptance.threshold, ordered)
+    assert not isinstance(matcher, str)
+    chosen, smooths = model.matching(matcher).acceptance, matcher is not None and matcher.whole
     if loops is not None:
-        turns = headings != 1 and headings
-        sequences.check_loops(loops, top=top, cluster=cluster, centre=ordering.centre, headings=turns)
         chosen = model.loop_matching(loops, PlaceSmoother() if smooths else None).acceptance
         matches = iter([model.loops(query, loops, smooths, True)])
         matcher = None
     else:
-        matches = model.matches(query, True, matcher, None, top, SUPPRESSION, centre, headings)
+        alone = smooths or matcher is None
+        centre = alone and querying.centres(ordered and model.centres(len(query)))
+        asked = replace(querying.by(matcher), centre="mean" if centre else "none")
+        matches = model.matches(query, asked, True, apart=SUPPRESSION)
     if top is not None:
         matches = (part.map(Tensor.flatten) for part in matches)
     counts, lost = Counter[str](), set[bool]()

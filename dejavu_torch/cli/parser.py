@@ -8,10 +8,10 @@ import os
 import re
 import sys
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import is_dataclass
+from dataclasses import fields, is_dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any, NoReturn, cast, get_args, get_origin
+from typing import Any, NoReturn, Union, cast, get_args, get_origin, get_type_hints
 
 import docstring_parser
 import jsonargparse
@@ -20,14 +20,14 @@ from jsonargparse.typing import restricted_string_type
 from dejavu_torch.cli.messages import LONGEST, UsageError, by_options, causes, refusal
 from dejavu_torch.cli.names import FIRST_OPTIONS
 from dejavu_torch.cli.networks import accept_networks, is_made, names_network
-from dejavu_torch.cli.options import named_features, refuse_with
+from dejavu_torch.cli.options import named_features
 from dejavu_torch.cli.presets import find_config, read_config
 from dejavu_torch.data.files import LARGEST
 from dejavu_torch.data.source import check_not_read
 from dejavu_torch.features.hub import made as made  # config files name it here
 from dejavu_torch.maps.spectral import SpectralMapper
 from dejavu_torch.model import DejaVu
-from dejavu_torch.text import one_line
+from dejavu_torch.text import one_line, refuse_with
 from dejavu_torch.types import Facts, InputError, expect
 
 MODEL = "model"  # the parameter of a command that is a DejaVu: each of its arguments is an option
@@ -213,7 +213,7 @@ def command_parser(name: str, function: Callable[..., None], program: str = "dej
         elif is_dataclass(options := parameter.annotation):
             title, own = described(cast(type, options))
             group = parser.add_argument_group(str(title).strip().rstrip("."))
-            for one in inspect.signature(cast(type, options), eval_str=True).parameters.values():
+            for one in fields_of(cast(type, options)):
                 add_option(group, one.replace(kind=one.KEYWORD_ONLY), own)
         else:
             add_option(parser, parameter, helps)
@@ -227,6 +227,19 @@ def described(thing: Callable[..., object]) -> tuple[str | None, dict[str, str |
         text = docstring_parser.parse(inspect.getdoc(one) or "")
         helps |= {one.arg_name: one.description for one in text.params}
     return text.description, helps
+
+
+def fields_of(options: type) -> Iterator[inspect.Parameter]:
+    """The fields of a dataclass that are options; what Python takes in place of text is left out of them."""
+    types = get_type_hints(options)
+    hidden = {one.name for one in fields(options) if not one.metadata.get("option", True)}
+    for one in inspect.signature(options).parameters.values():
+        kind, kinds = types[one.name], get_args(types[one.name])
+        if str in kinds:
+            known = [part for part in kinds if part in (str, type(None)) or get_origin(part) is list]
+            kind = Union[tuple(known)]  # noqa: UP007
+        if one.name not in hidden:
+            yield one.replace(annotation=kind)
 
 
 def add_option(parser: Any, parameter: inspect.Parameter, helps: Mapping[str, str | None]) -> None:
@@ -255,7 +268,7 @@ def grouped(function: Callable[..., None], arguments: Facts) -> Facts:
     for key, parameter in inspect.signature(function, eval_str=True).parameters.items():
         if is_dataclass(parameter.annotation):
             options = cast(type, parameter.annotation)
-            names = inspect.signature(options).parameters
+            names = [one.name for one in fields_of(options)]
             arguments[key] = options(**{name: arguments.pop(name) for name in names})
     return arguments
 

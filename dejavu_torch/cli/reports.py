@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import webbrowser
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -20,11 +21,11 @@ from dejavu_torch.cli.device import device_of
 from dejavu_torch.data.output import check_output_file, check_output_folder, whole_folder
 from dejavu_torch.data.source import check_not_read, open_source
 from dejavu_torch.evaluation.answers import describe_line
+from dejavu_torch.evaluation.options import UNREAD, Reporting, several
 from dejavu_torch.model import DejaVu
 from dejavu_torch.model_file import recipe_of
-from dejavu_torch.recognition.filter import PlaceFilter
-from dejavu_torch.recognition.smoother import PlaceSmoother
-from dejavu_torch.types import Facts, InputError, expect
+from dejavu_torch.recognition.querying import Querying
+from dejavu_torch.types import InputError, expect
 
 if TYPE_CHECKING:
     from dejavu_torch.evaluation.compare import Comparison
@@ -61,7 +62,7 @@ def run_demo(
     from dejavu_torch.evaluation.compare import compare
     from dejavu_torch.evaluation.reproduce import paper_model
 
-    _check_report_folder(out, COMPARED, options.several(second))
+    _check_report_folder(out, COMPARED, several(second))
     given = options.LearningOptions(seed, second)
     given.seed_whitening(model)
     learned, localized = DEMO
@@ -70,18 +71,17 @@ def run_demo(
     reference, query = open_source(learned), open_source(localized)
     what = "simulated flights over one road" if simulated else "real flights over one road"
     print(f"two {what}: learning {learned}, then finding the frames of {localized}", flush=True)
-    reference, views, _ = given.with_views(model, reference, query)
+    reference, opened = given.with_views(model, reference, query)
     paper = paper_model()
     same = recipe_of(model.mapper) == recipe_of(paper.mapper)
     others = {} if same else {"paper": ("the paper to the letter", paper)}
-    settings: Facts = {"seed": seed, "second": views, "others": others, "progress": True}
     title = f"dejavu demo: two {what}"
 
     def on_found(found: Comparison) -> None:
         _publish_found(found, out, title, command, verbose=verbose)
 
-    settings |= {"drives": drives, "on_found": on_found}
-    result = compare(reference, query, model=model, storage_curve=True, **settings)
+    reporting = Reporting(storage_curve=True, drives=drives, others=others, on_found=on_found, progress=True)
+    result = compare(reference, query, model=model, learning=opened, reporting=reporting)
     _publish(result, out, title, command, verbose=verbose, show=open)
     print_localize(out / "map.safetensors", model, command, localized, "or try")
     print_next("compare", "MORNING", "EVENING")
@@ -93,13 +93,10 @@ def run_compare(
     *,
     out: Path | None = None,
     open: bool = False,
-    loops: int | None = None,
-    headings: int = 1,
     judging: options.EvaluationOptions,
     learning: options.LearningOptions,
     map: Path | None = None,
-    sequences: options.Sequences,
-    ordering: options.Ordering,
+    querying: Querying,
     searching: options.Searching,
     model: DejaVu,
     command: str,
@@ -110,8 +107,6 @@ def run_compare(
     Args:
         reference: the visit to learn: a folder of images, a video, or another source of `dejavu learn`
         query: the visit whose frames are found; none with --loops
-        loops: find where the reference returns to its own places, as in localize
-        headings: tried per image, see localize
         out: folder for report, pictures, matches.csv and map.safetensors; by default dejavu_report, or
             dejavu_report_2 and so on if that exists
         open: show the report in a browser
@@ -120,11 +115,16 @@ def run_compare(
     from dejavu_torch.evaluation.compare import compare
 
     out = _unused_folder() if out is None else out
-    _check_loops(loops, query, sequences, ordering, judging)
+    within, loops = max(0, judging.tolerance), querying.loops
+    if loops is None:
+        expect(query is not None, "a second visit, or --loops within the first", "compare without QUERY")
+    else:
+        expect(query is None, "the reference alone", f"--loops {loops} and the query {query}")
+    judging.check_loops(querying)
     where = device_of(learning.device, learns=map is None)
     acceptance = options.Acceptance(model.threshold, model.precision)
-    matcher = sequences.matcher(max(0, judging.tolerance), acceptance.threshold)
-    ordered = ordering.of(matcher)
+    matcher = querying.matcher(within, acceptance.threshold)
+    ordered = querying.order(matcher)
     acceptance.check(matcher, judging.distractors)
     if map is not None:
         model = options.load_map(map, options.named_features(model))
@@ -133,64 +133,32 @@ def run_compare(
     searching.of(model.to(where))
     first = open_source(reference)
     queries = first if query is None else open_source(query)
-    in_order = queries.ordered if ordered is None else ordered
-    matcher = ordering.chosen(matcher, in_order, max(0, judging.tolerance), acceptance.threshold)
-    if isinstance(matcher, PlaceFilter | PlaceSmoother) and acceptance.threshold is not None and query:
+    matcher = querying.matcher(within, acceptance.threshold, queries.ordered if ordered is None else ordered)
+    assert not isinstance(matcher, str)
+    tells = matcher is not None and matcher.answers != "sequence"  # probabilities
+    if tells and acceptance.threshold is not None and query:
         model.threshold = None  # it is for a probability, so the map must not keep it
-    seconds = options.several(learning.second)
+    seconds = several(learning.second)
     _check_report_folder(
         out, COMPARED, [reference, *filter(None, [query]), *seconds], [judging.truth, *learning.files]
     )
-    others = [open_source(one) for one in (*seconds, learning.calibration) if one not in options.UNREAD]
+    others = [open_source(one) for one in (*seconds, learning.calibration) if one not in UNREAD]
     distractors = judging.off_map([first, queries, *others])
-    if not isinstance(matcher, PlaceSmoother):  # which has probabilities of its own
+    if matcher is None or not matcher.whole:  # which has probabilities of its own
         learning.check_calibrated(model, first, map, judging.distractors)
     learning.seed_whitening(model)
-    first, views, known = learning.with_views(model, first, queries)
+    first, opened = learning.with_views(model, first, queries)
     on, asked = short_name(reference), None if query is None else short_name(query)
     title = f"loops within {on}" if asked is None else f"{asked} found on {on}"
-    result = compare(
-        first,
-        None if query is None else queries,
-        judging.truth,
-        model,
-        tolerance=judging.tolerance,
-        leave_out=judging.leave_out,
-        seed=learning.seed,
-        interpolate=judging.interpolate,
-        second=views,
-        sequence=matcher,
-        top=1 if judging.top is None else judging.top,
-        calibration="none" if learning.calibration == options.NO_CALIBRATION else known,
-        distractors=distractors,
-        storage_curve=judging.storage_curve,
-        ordered=ordered,
-        centre=None if ordering.centre is None else ordering.centre == "mean",
-        loops=loops,
-        headings=headings,
-        drives=judging.drives,
-        on_found=lambda found: _publish_found(found, out, title, command, map, judging.top),
-        progress=True,
-    )
-    _publish(result, out, title, command, show=open)
 
+    def on_found(found: Comparison) -> None:
+        _publish_found(found, out, title, command, map, querying.top)
 
-def _check_loops(
-    loops: int | None,
-    query: str | None,
-    sequences: options.Sequences,
-    ordering: options.Ordering,
-    judging: options.EvaluationOptions,
-) -> None:
-    """Refuse a comparison without a query, and loops with what needs one."""
-    if loops is None:
-        expect(query is not None, "a second visit, or --loops within the first", "compare without QUERY")
-        return
-    expect(query is None, "the reference alone", f"--loops {loops} and the query {query}")
-    of_routes = {
-        name: getattr(judging, name) for name in ("top", "distractors", "storage_curve", "leave_out")
-    }
-    sequences.check_loops(loops, centre=ordering.centre, **of_routes)
+    reporting = replace(judging, distractors=distractors, on_found=on_found, progress=True)
+    querying = replace(querying.by(matcher), ordered=ordered is True, unordered=ordered is False)
+    found = None if query is None else queries
+    settings = judging.truth, model, judging.tolerance, opened, querying, reporting
+    _publish(compare(first, found, *settings), out, title, command, show=open)
 
 
 def run_evaluate(
@@ -227,13 +195,14 @@ def run_evaluate(
         higher_is_better: the scores are similarities, not distances
         loops: as in localize: only places more than this many frames before a query are right
     """
-    from dejavu_torch.evaluation.evaluate import evaluate_file
+    from dejavu_torch.evaluation.evaluate import Asked, evaluate_file
     from dejavu_torch.evaluation.report import report_folder, write_report
 
     first, second = (None if source is None else open_source(source) for source in (reference, query))
     _check_report_folder(out, (), [reference, query], [matches, truth, map])
-    given = first, second, map, route, recall_values, higher_is_better, loops
-    result = evaluate_file(matches, truth, tolerance, interpolate, *given)
+    asked = Asked(first, second, map, route)
+    given = asked, interpolate, recall_values, higher_is_better, loops
+    result = evaluate_file(matches, truth, tolerance, *given)
     with report_folder(out) as folder:
         title = f"{short_name(matches)} evaluated by {short_name(truth)}"
         write_report(folder, result.report, result.pictures, title, command)

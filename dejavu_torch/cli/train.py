@@ -23,10 +23,10 @@ from pytorch_lightning.cli import LightningArgumentParser, LightningCLI
 from dejavu_torch.cli.commands import features_words, print_map, print_next
 from dejavu_torch.cli.messages import refusal
 from dejavu_torch.cli.networks import with_hub
-from dejavu_torch.cli.options import several
 from dejavu_torch.cli.parser import Parser, Preset
 from dejavu_torch.cli.process import interrupts_raise
 from dejavu_torch.data.output import check_output_folder, make_output_folder, remove_empty_folders
+from dejavu_torch.evaluation.options import several
 from dejavu_torch.features.embedding import Embedding
 from dejavu_torch.model import DejaVu
 from dejavu_torch.text import one_line

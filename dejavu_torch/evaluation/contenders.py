@@ -151,10 +151,9 @@ def models_beside(
     models: dict[Together, SequenceModel] = {}
     place_filter = PlaceFilter(within=within)
     if sequence is not None:
-        own = sequence if isinstance(sequence, SequenceMatcher) else SequenceMatcher(1)
-        lengths = (length for length in sorted({*LENGTHS, own.length}) if length <= min(queries, places))
-        models |= {length: SequenceMatcher(length, own.speeds) for length in lengths}
-    if isinstance(sequence, PlaceFilter):
+        lengths = (length for length in sorted({*LENGTHS, sequence.length}) if length <= min(queries, places))
+        models |= {length: SequenceMatcher(length, sequence.speeds or (1.0,)) for length in lengths}
+    if sequence is not None and sequence.answers == "filter":
         models["filter"] = sequence
     elif ordered and queries > 1 and places >= len(place_filter.move_logits):
         models["filter"] = place_filter

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import logging
-import math
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import NamedTuple
@@ -62,15 +61,57 @@ class Evaluation(NamedTuple):
     pictures: Pictures
 
 
+@dataclass(frozen=True)
+class Asked:
+    """What matches were found in.
+
+    Args:
+        reference, query: the traverses, if they carry the ground truth. Without a reference or a map the
+            number of frames is unknown, and an offset gives every query a right answer.
+        map: file of a map of the reference. If its places are resampled by distance, matches and ground
+            truth are translated from frames to places.
+        route: for matches on a merged map, the route of the truth and the reference: answers on other routes
+            are wrong.
+    """
+
+    reference: Traverse | None = None
+    query: Traverse | None = None
+    map: Path | None = None
+    route: str | None = None
+
+    def places(self) -> tuple[PlaceMap | None, Traverse | None, Layout]:
+        """The map, if there is one, the reference, which of an area is that of the map, and the layout."""
+        place_map, reference = None if self.map is None else self._map(self.map), self.reference
+        layout = ROUTE if place_map is None else place_map.layout
+        if layout.on_ground and reference is None:
+            windows = ArrayTraverse(torch.zeros(layout.places, 1), str(self.map))
+            coordinates = layout.coordinates(torch.arange(layout.places))
+            reference = windows.changed(
+                coordinates=Coordinates(coordinates, frame=layout.frame), _layout=layout
+            )
+        if reference is not None and layout.on_ground:
+            own = reference.layout.same(layout)
+            expect(own, "that of the map, or no reference", f"{reference.name} is not the area of {self.map}")
+        return place_map, reference, layout if reference is None else reference.layout
+
+    def _map(self, map: Path) -> PlaceMap:
+        place_map = read_place_map(map)
+        if self.route is None:
+            place_map.layout.expect_one("--route with the one of the truth", str(map))
+        if place_map.layout.count == 1 or not isinstance(place_map, SpectralMap):
+            return place_map
+        return place_map.part(str(self.route))
+
+
+ANYWHERE = Asked()
+
+
 def evaluate_file(
     matches: Path,
     truth: str | None,
     tolerance: int = 5,
+    asked: Asked = ANYWHERE,
     interpolate: bool = False,
-    reference: Traverse | None = None,
-    query: Traverse | None = None,
-    map: Path | None = None,
-    route: str | None = None,
     recall_values: Sequence[int] = (),
     higher_is_better: bool = False,
     loops: int | None = None,
@@ -81,13 +122,8 @@ def evaluate_file(
         matches: see `read_matches`.
         truth: see `find_ground_truth`; None needs both traverses.
         tolerance: frames within which an answer is right, inclusive; places if the map is resampled.
+        asked: what the matches were found in, as far as it is known.
         interpolate: see `find_ground_truth`.
-        reference, query: the traverses, if they carry the ground truth. Without a reference or a map the
-            number of frames is unknown, and an offset gives every query a right answer.
-        map: file of a map of the reference. If its places are resampled by distance, matches and ground
-            truth are translated from frames to places.
-        route: for matches on a merged map, the route of `truth` and `reference`: answers on other routes are
-            wrong.
         recall_values: see `recall_over_all`; each at most the ranks of a query.
         higher_is_better: the scores are similarities.
         loops: see `DejaVu.loops`; only places this many frames before a query can be right.
@@ -96,52 +132,34 @@ def evaluate_file(
         InputError: matches, ground truth or map that cannot be read, do not fit each other, or leave no query
             to score.
     """
-    if tolerance < 0:
-        raise InputError(f"the tolerance is {tolerance}; expected at least 0")
+    expect(tolerance >= 0, "at least 0", f"the tolerance is {tolerance}")
     parsed = None if truth is None else check_ground_truth(truth, interpolate)
-    place_map = None if map is None else _map_of(map, route)
-    layout = ROUTE if place_map is None else place_map.layout
-    if layout.on_ground and reference is None:
-        reference = _windows(layout, str(map))
-    if reference is not None and place_map is not None and layout.on_ground:
-        own = reference.layout.same(layout)
-        expect(own, "that of the map, or no reference", f"{reference.name} is not the area of {map}")
-    layout = layout if reference is None else reference.layout
-    near = parsed if isinstance(parsed, Near) else None
-    if near is not None:
-        check_unit(near, layout)
-    elif tolerance:  # numbers of places tell no distance over an area
-        expected = "--tolerance 0, or the distance in the truth, such as --truth pixels:10"
-        layout.expect_route(expected, f"the places are those of an area, the tolerance is {tolerance} places")
-    tolerance = layout.reach(tolerance).tolerance
+    place_map, reference, layout = asked.places()
+    near = _near(parsed, layout, tolerance)
+    tolerance, query, route = layout.reach(tolerance).tolerance, asked.query, asked.route
     positions = torch.zeros(0, dtype=torch.float32) if place_map is None else place_map.positions
-    resampled = len(positions) > 0
-    frames = places = None if reference is None else len(reference)
-    if place_map is not None:
-        places = place_map.places
-        frames = len(positions) if resampled else places
-    queries, match, candidates = read_matches(matches, route, resampled)
-    if higher_is_better:
-        match = replace(match, score=torch.where(match.score.isfinite(), -match.score, math.inf))
-    elsewhere = candidates == ELSEWHERE
-    if frames is not None and int(candidates.max()) >= frames:
-        raise InputError(f"{matches} reports place {int(candidates.max())}; expected one below {frames}")
+    resampled, places = len(positions) > 0, None if reference is None else len(reference)
+    places = places if place_map is None else place_map.places
+    frames = len(positions) if resampled else places
+    queries, match, candidates = read_matches(matches, route, resampled, higher_is_better)
+    highest = int(candidates.max())
+    expect(frames is None or highest < frames, f"one below {frames}", f"{matches} reports place {highest}")
     known = find_ground_truth(truth, reference, query, frames, queries, interpolate, resampled)
     if known is None:
         raise InputError("there is no ground truth; expected one, or sources with coordinates")
     carried = all(traverse is not None and traverse.places is not None for traverse in (reference, query))
     alone = answer_facts(match, queries, tolerance, True, offset_of(truth, carried))
+    elsewhere, numbers = candidates == ELSEWHERE, queries
     if place_map is not None:
-        known = ground_truth_in_places(known, place_map.place_of)
-        candidates = place_map.place_of(candidates)
-    if loops is not None:
-        known = of_loops(known, queries if place_map is None else place_map.place_of(queries), loops)
+        known, candidates = ground_truth_in_places(known, place_map.place_of), place_map.place_of(candidates)
+        numbers = place_map.place_of(queries)
+    known = known if loops is None else of_loops(known, numbers, loops)
     here = replace(match, index=candidates[:, 0].masked_fill(elsewhere[:, 0], -1))
     if route is not None:  # number places on other routes beyond every place of this one and its truth
         highest = max(int(table.max()) for table in (candidates, known.positives) if table.numel())
         candidates = candidates.masked_fill(elsewhere, max(places or 0, 1 + highest) + tolerance)
     match = replace(match, index=candidates[:, 0])
-    reach = reach_of(tolerance, known, isinstance(parsed, Near))
+    reach = reach_of(tolerance, known, near is not None)
     if match.probability is not None and reach != TOLERANCE:
         line = (
             "probabilities that `localize` writes are of being within %d places; here one is right within %d"
@@ -151,10 +169,10 @@ def evaluate_file(
     facts = evaluation_facts(match, candidates, known, tolerance, positions, described) | alone
     if near is not None and layout.units:
         facts |= {"tolerance": plain_number(near.radius), "unit": layout.units}
-    if isinstance(parsed, Near) and loops is None and reference is not None and query is not None:
-        stored, asked = coordinates_of([reference, query], parsed.kind)
-        frames_found = here.index if place_map is None else place_map.frame_of(here.index)
-        facts |= shift_facts(parsed, here, stored[frames_found], asked[queries])
+    if near is not None and loops is None and reference is not None and query is not None:
+        stored, own = coordinates_of([reference, query], near.kind)
+        found = here.index if place_map is None else place_map.frame_of(here.index)
+        facts |= shift_facts(near, here, stored[found], own[queries])
     accepted = facts["accepted"]
     facts["accepted_precision"] = facts["accepted_right"] / accepted if accepted else None
     facts |= {"matches": str(matches), "places": places}
@@ -173,22 +191,15 @@ def evaluate_file(
     return Evaluation(Report(ours, {}, facts), queries, match, known, pictures)
 
 
-def _map_of(map: Path, route: str | None) -> PlaceMap:
-    """The map of a file, or that of one of its routes."""
-    place_map = read_place_map(map)
-    if route is None:
-        place_map.layout.expect_one("--route with the one of the truth", str(map))
-    if place_map.layout.count == 1 or not isinstance(place_map, SpectralMap):
-        return place_map
-    return place_map.part(str(route))
-
-
-def _windows(layout: Layout, name: str) -> Traverse:
-    """The places of a map as a traverse with their coordinates."""
-    windows = ArrayTraverse(torch.zeros(layout.places, 1), name)
-    windows.coordinates = Coordinates(layout.coordinates(torch.arange(layout.places)), frame=layout.frame)
-    windows.layout = layout
-    return windows
+def _near(parsed: object, layout: Layout, tolerance: int) -> Near | None:
+    """The distance within which answers are right, if the truth tells one; over an area it has to."""
+    if isinstance(parsed, Near):
+        check_unit(parsed, layout)
+        return parsed
+    if tolerance:  # numbers of places tell no distance over an area
+        expected = "--tolerance 0, or the distance in the truth, such as --truth pixels:10"
+        layout.expect_route(expected, f"the places are those of an area, the tolerance is {tolerance} places")
+    return None
 
 
 def _look_similar(match: Match, truth: GroundTruth, tolerance: int) -> bool:

@@ -79,7 +79,7 @@ def _run_facts(run: Localization, seconds: Mapping[str, float]) -> Facts:
     if smoother is not None:
         facts["drive"] = drive = smoother.settled()
         if run.truth is not None:
-            block = math.ceil(smoother.correlation)
+            block = math.ceil(drive["correlation"])
             drive["auc_error"] = auc_error(run.scored, run.truth, run.tolerance, block)
     if run.matching.apart is not None:
         facts["loops"] = run.matching.apart

@@ -143,7 +143,9 @@ def _name(names: Sequence[str], frame: int) -> str:
     return printable(names[frame]) if names and frame >= 0 else ""
 
 
-def read_matches(path: Path, route: str | None = None, repeats: bool = False) -> Matches:
+def read_matches(
+    path: Path, route: str | None = None, repeats: bool = False, higher_is_better: bool = False
+) -> Matches:
     """Read the matches in a csv, from any method.
 
     Args:
@@ -158,6 +160,7 @@ def read_matches(path: Path, route: str | None = None, repeats: bool = False) ->
             route: the route of the place.
         route: the route whose places can be right; needed if the file has that column.
         repeats: whether a query may be there several times, as resampled footage shows a frame.
+        higher_is_better: the scores are similarities, whose signs change.
 
     Convention: a row with place -1 or score inf reports nothing: place -1, score inf, not accepted,
         probability 0.
@@ -203,7 +206,9 @@ def read_matches(path: Path, route: str | None = None, repeats: bool = False) ->
             found = f"query {one.query} has {len(places)} ranks"
             raise InputError(f"{path}: {found}; expected {len(ranked[0])}, as query {answers[0].query} has")
     queries, _, index, scores, accepted, probability, sure = zip(*answers, strict=True)
-    match = Match(torch.tensor(index), torch.tensor(scores, dtype=torch.float64), torch.tensor(accepted))
+    score = torch.tensor(scores, dtype=torch.float64)
+    score = torch.where(score.isfinite(), -score, math.inf) if higher_is_better else score
+    match = Match(torch.tensor(index), score, torch.tensor(accepted))
     if None not in sure:
         match = replace(match, confidence=torch.tensor(sure, dtype=torch.float64))
     if "probability" in cells:

@@ -14,6 +14,7 @@ from dejavu_torch.evaluation.activation import share
 from dejavu_torch.evaluation.compare import Comparison, compare
 from dejavu_torch.evaluation.contenders import Contender, contend
 from dejavu_torch.evaluation.controls import leave_out_match, with_mapper
+from dejavu_torch.evaluation.options import Reporting
 from dejavu_torch.evaluation.paper_tables import PUBLISHED
 from dejavu_torch.evaluation.pictures import paper_pictures
 from dejavu_torch.evaluation.report import Report
@@ -76,7 +77,8 @@ def reproduce(
     address = f"sim:{dataset}?seed={seed}" + (f"&frames={frames}" if frames else "")
     reference, query = open_source(address), open_source(f"{address}&traverse=1")
     model = paper_model(reference) if model is None else model
-    result = compare(reference, query, model=model, tolerance=tolerance, progress=progress)
+    reporting = Reporting(progress=progress)
+    result = compare(reference, query, model=model, tolerance=tolerance, reporting=reporting)
     places = result.run.reference_features
     itself = torch.arange(len(places))[:, None]
     left_out = f"ideal, +-{tolerance} {result.run.unit} left out"

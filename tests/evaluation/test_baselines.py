@@ -21,9 +21,11 @@ from dejavu_torch.evaluation.baselines import (
     quantised_every_kth,
     stored_frames,
 )
+from dejavu_torch.evaluation.options import Learning
 from dejavu_torch.evaluation.quantiser import product_quantised
 from dejavu_torch.places.layout import Layout
 from dejavu_torch.recognition.localizer import Matching
+from dejavu_torch.recognition.querying import Querying
 from dejavu_torch.recognition.scorer import OfStored
 from dejavu_torch.recognition.sequence import SequenceMatcher
 
@@ -162,7 +164,15 @@ def test_the_bytes_of_coded_frames_of_an_area_are_those_of_the_frames_that_are_a
     reference, query = ArrayTraverse(rows), ArrayTraverse(rows + 0.2)
     reference.layout = query.layout = Layout(30, 29)
     model = DejaVu(None, "none", mapper=SpectralMapper(0.5))
-    run = compare(reference, query, "0", model, sequence=None, tolerance=2, calibration="none").run
+    run = compare(
+        reference,
+        query,
+        "0",
+        model,
+        tolerance=2,
+        querying=Querying(match="single"),
+        learning=Learning(calibration="none"),
+    ).run
     coded = dict(baselines_of(run))["product_quantiser"]
     assert coded.k == 3
     assert len(coded.scorer.stored) == 10 * 10

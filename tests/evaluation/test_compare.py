@@ -19,12 +19,14 @@ from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.evaluation.compare import compare
 from dejavu_torch.evaluation.controls import null_control
 from dejavu_torch.evaluation.curves import evaluate
+from dejavu_torch.evaluation.options import Learning, Reporting
 from dejavu_torch.evaluation.pictures import draw_compared, draw_pictures
 from dejavu_torch.evaluation.report import score_table, sequence_table
 from dejavu_torch.features.descriptor import Descriptor
 from dejavu_torch.features.pixels import PatchPixels
 from dejavu_torch.features.views import LabelledFrames
 from dejavu_torch.recognition.filter import PlaceFilter
+from dejavu_torch.recognition.querying import Querying
 from dejavu_torch.types import FrequencyLayer, Training
 
 
@@ -93,7 +95,9 @@ def trained(model):
 
 def test_the_null_of_a_trained_map_has_the_templates_of_shuffled_frames(trained):
     reference, query = route(0), route(1)
-    result = compare(ArrayTraverse(reference), ArrayTraverse(query), "0", model=trained, seed=5)
+    result = compare(
+        ArrayTraverse(reference), ArrayTraverse(query), "0", model=trained, learning=Learning(seed=5)
+    )
     null = result.report.contenders["null"]
     assert null.name == "control: templates of shuffled frames"
     assert "null_same_plan" not in result.report.contenders
@@ -189,7 +193,9 @@ def test_sequences_of_every_contender(kind):
     pair = ArrayTraverse(passing(1)), ArrayTraverse(passing(2))
 
     def report(sequence):
-        return compare(*pair, "0", model=model, tolerance=1, sequence=sequence).report.as_json()
+        return compare(
+            *pair, "0", model=model, tolerance=1, querying=Querying(match=sequence or "single")
+        ).report.as_json()
 
     single, seven, filtered = report(None), report(SequenceMatcher(7)), report(PlaceFilter(within=1))
     keys = {key for key, entry in single.items() if isinstance(entry, dict) and "auc" in entry}
@@ -208,7 +214,9 @@ def test_sequences_of_every_contender(kind):
         }
     assert seven["sequences"]["1"]["auc"] < 0.7 < 0.9 < seven["sequences"]["21"]["auc"]
     # 20 queries have no sequence of 21
-    short = compare(pair[0], ArrayTraverse(passing(2)[:20]), "0", model, sequence=SequenceMatcher(3))
+    short = compare(
+        pair[0], ArrayTraverse(passing(2)[:20]), "0", model, querying=Querying(match=SequenceMatcher(3))
+    )
     assert list(short.report.as_json()["null"]["sequences"]) == ["1", "3", "5", "11"]
 
 
@@ -220,8 +228,10 @@ def test_a_filter_stands_beside_single_queries_in_order_and_changes_nothing_else
     )
 
     def report(ordered, storage=False, drives="all"):
-        settings = {"tolerance": 1, "ordered": ordered, "storage_curve": storage, "drives": drives}
-        result = compare(*pair, "0", model, sequence=None, centre=False, **settings).report
+        order = {"ordered": ordered is True, "unordered": ordered is False}
+        querying = Querying(match="single", centre="none", **order)
+        reporting = Reporting(storage_curve=storage, drives=drives)
+        result = compare(*pair, "0", model, 1, querying=querying, reporting=reporting).report
         ways = ["AUC, one image", "as it drives", "whole drive"]
         assert (score_table(result)[0][1:4] == ways) == bool(ordered)
         assert sequence_table(result) == []
@@ -230,8 +240,12 @@ def test_a_filter_stands_beside_single_queries_in_order_and_changes_nothing_else
 
     single, ordered = report(False), report(True, storage=True)
     assert "sequences" not in report(None)  # an array does not tell
-    assert not compare(*pair, None, model, ordered=True).run.matching.also  # nothing would show it
-    filtered = compare(*pair, "0", model, tolerance=1, sequence=PlaceFilter(within=1)).report.as_json()
+    assert not compare(
+        *pair, None, model, querying=Querying(ordered=True)
+    ).run.matching.also  # nothing would show it
+    filtered = compare(
+        *pair, "0", model, tolerance=1, querying=Querying(match=PlaceFilter(within=1))
+    ).report.as_json()
     for key in (None, *(key for key, entry in single.items() if isinstance(entry, dict) and "auc" in entry)):
         one, other, by_filter = (all_ if key is None else all_[key] for all_ in (single, ordered, filtered))
         assert list(other["sequences"]) == ["filter", "smoother"]
@@ -264,7 +278,9 @@ def test_single_images_beside_a_drive_have_probabilities():
 def test_seqslam_s_pixels_stand_beside_a_sequence_of_frames():
     """In frames of noise that repeat after 8, its sequences find what single frames do not."""
     model = template_model(nn.Flatten(), SpectrogramAnalysis(window=64, min_period=4, strongest=1))
-    found = compare(pictures(1), pictures(2), "0", model, tolerance=3, sequence=SequenceMatcher(5)).report
+    found = compare(
+        pictures(1), pictures(2), "0", model, tolerance=3, querying=Querying(match=SequenceMatcher(5))
+    ).report
     one = found.contenders["seqslam"]
     assert one.bytes == one.route_bytes == 64 * 24 * 24 * 4
     assert one.k == 1
@@ -286,7 +302,7 @@ def test_each_long_step_has_a_bar_on_a_terminal(terminal, monkeypatch):
     stream = Terminal() if terminal else io.StringIO()
     monkeypatch.setattr(sys, "stderr", stream)
     pair = [open_source(f"sim:aerial?frames=80&traverse={one}") for one in (0, 1)]
-    compare(*pair, distractors=[open_source("sim:outdoor?frames=10")], progress=True)
+    compare(*pair, reporting=Reporting(distractors=[open_source("sim:outdoor?frames=10")], progress=True))
     steps = "learning", "calibrating", f"describing {pair[1].name}", "localizing"
     steps += "describing sim:outdoor", "baselines"
     assert [step for step in steps if step in stream.getvalue()] == ([*steps] if terminal else [])
@@ -297,11 +313,16 @@ def test_routes_off_the_map_are_prepared_as_queries_are(monkeypatch):
     monkeypatch.setattr("dejavu_torch.evaluation.compare.draw_pictures", lambda *_: {})
     features = [ArrayTraverse(smooth(seed), str(seed)) for seed in (0, 0, 3)]
     views = LabelledFrames(ArrayTraverse(smooth(0) + 0.1), torch.arange(200))
-    found = compare(*features[:2], "0", distractors=features[2:], calibration=views).report.facts
+    found = compare(
+        *features[:2],
+        "0",
+        learning=Learning(calibration=views),
+        reporting=Reporting(distractors=features[2:]),
+    ).report.facts
     assert found["rejection"]["off_map"]["3"]["frames"] == 200
     drives = [ArrayTraverse(ground(at), name) for at, name in ((REFERENCE, "a"), (QUERY, "b"), (QUERY, "c"))]
     model = DejaVu(velocity=camera(step=STEP))
-    found = compare(*drives[:2], model=model, distractors=drives[2:]).report.facts
+    found = compare(*drives[:2], model=model, reporting=Reporting(distractors=drives[2:])).report.facts
     assert found["queries"] == found["rejection"]["off_map"]["c"]["frames"]
 
 
@@ -317,4 +338,4 @@ def test_routes_of_another_kind_are_refused_before_learning(reference, other, fa
     monkeypatch.setattr(Descriptor, "learn", None)
     pair = ArrayTraverse(torch.rand(reference), "route"), ArrayTraverse(torch.rand(reference), "again")
     with refused("route", "elsewhere", *facts):
-        compare(*pair, distractors=[ArrayTraverse(torch.rand(other), "elsewhere")])
+        compare(*pair, reporting=Reporting(distractors=[ArrayTraverse(torch.rand(other), "elsewhere")]))

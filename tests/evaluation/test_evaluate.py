@@ -13,7 +13,7 @@ from helpers import Fixed, refused, template_model
 from dejavu_torch import FrequencyLayer
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.evaluation.curves import RECALL_DEFINITION, evaluate
-from dejavu_torch.evaluation.evaluate import evaluate_file
+from dejavu_torch.evaluation.evaluate import Asked, evaluate_file
 from dejavu_torch.evaluation.matches import write_matches
 from dejavu_torch.types import Match
 
@@ -101,9 +101,9 @@ def test_truth_that_lies_in_the_traverses(tmp_path):
     path = written(tmp_path, MATCHES)
     stored, seen = ArrayTraverse(torch.rand(60, 2)), ArrayTraverse(torch.rand(5, 2))
     with refused("no ground truth"):
-        evaluate_file(path, None, reference=stored, query=seen)
+        evaluate_file(path, None, asked=Asked(stored, seen))
     stored.places, seen.places = torch.arange(60.0), torch.tensor([0.0, 4.2, 2.0, 3.0, 30.0])
-    assert evaluate_file(path, None, 0, reference=stored, query=seen).report.facts["accepted_right"] == 3
+    assert evaluate_file(path, None, 0, Asked(stored, seen)).report.facts["accepted_right"] == 3
 
 
 def test_recall_values_by_hand(tmp_path):
@@ -140,7 +140,7 @@ def test_what_does_not_fit_is_refused(tmp_path):
     with refused("no ground truth"):
         evaluate_file(path, None)
     with refused("place 50", "below 20"):
-        evaluate_file(path, "0", reference=ArrayTraverse(torch.rand(20, 2)))
+        evaluate_file(path, "0", asked=Asked(ArrayTraverse(torch.rand(20, 2))))
     np.savez(tmp_path / "gt.npz", GThard=np.eye(60, 4, dtype=bool))
     with refused("GThard is (60, 4)", "(reference frames, 5)"):
         evaluate_file(path, str(tmp_path / "gt.npz"))
@@ -171,7 +171,7 @@ def resampled(tmp_path_factory):
 
 def test_convention_11_the_map_turns_frames_into_places(resampled):
     truth = str(resampled.map.parent / "truth.csv")
-    by_places = evaluate_file(resampled.matches, truth, tolerance=1, map=resampled.map)
+    by_places = evaluate_file(resampled.matches, truth, tolerance=1, asked=Asked(map=resampled.map))
     facts = by_places.report.facts
     assert (facts["unit"], facts["places"], facts["judged"]) == ("places at even steps", 101, 101)
     assert (by_places.match.index - resampled.match.index).abs().max() <= 1  # places that show one frame
@@ -183,14 +183,16 @@ def test_convention_11_the_map_turns_frames_into_places(resampled):
         evaluate_file(resampled.matches, truth, tolerance=1)
     (resampled.map.parent / "beyond.csv").write_text("query,place\n0,99999\n")
     with refused("place 99999", f"0 to {len(REFERENCE) - 1}"):
-        evaluate_file(resampled.matches, str(resampled.map.parent / "beyond.csv"), map=resampled.map)
+        evaluate_file(
+            resampled.matches, str(resampled.map.parent / "beyond.csv"), asked=Asked(map=resampled.map)
+        )
 
 
 def test_convention_11_all_frames_of_one_place_are_right(resampled, tmp_path):
     """It stands from frame 60 to 85: in places any of these is right, in frames only those near by."""
     path = written(tmp_path, HEADER + "0,85,0.1,1\n")
     truth = str(written(tmp_path, "0,60\n", "truth.csv"))
-    assert scores_of(evaluate_file(path, truth, 0, map=resampled.map))["recall_at_1"] == 1
+    assert scores_of(evaluate_file(path, truth, 0, asked=Asked(map=resampled.map)))["recall_at_1"] == 1
     assert scores_of(evaluate_file(path, truth, 24))["recall_at_1"] == 0
 
 

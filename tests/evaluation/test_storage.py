@@ -9,8 +9,10 @@ from helpers import refused, template_model
 from dejavu_torch import DejaVu, SequenceMatcher
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.evaluation.compare import compare
+from dejavu_torch.evaluation.options import Reporting
 from dejavu_torch.evaluation.storage import coded_at_sizes, noise_over_map
 from dejavu_torch.maps.spectral import SpectralMapper
+from dejavu_torch.recognition.querying import Querying
 
 PLACES, NUMBERS = 400, 16
 
@@ -27,7 +29,12 @@ def route(seed):
 def result():
     model = DejaVu(whitening="none", mapper=SpectralMapper(2.0))
     return compare(
-        ArrayTraverse(route(0)), ArrayTraverse(route(1)), "0", model=model, tolerance=2, storage_curve=True
+        ArrayTraverse(route(0)),
+        ArrayTraverse(route(1)),
+        "0",
+        model=model,
+        tolerance=2,
+        reporting=Reporting(storage_curve=True),
     )
 
 
@@ -64,7 +71,14 @@ def test_at_the_map_s_own_budget_the_curve_is_the_report(result, report):
 def test_each_budget_is_evaluated_at_every_length():
     model = DejaVu(whitening="none", mapper=SpectralMapper(2.0))
     pair = ArrayTraverse(route(0)), ArrayTraverse(route(1))
-    found = compare(*pair, "0", model=model, tolerance=2, sequence=SequenceMatcher(5), storage_curve=True)
+    found = compare(
+        *pair,
+        "0",
+        model=model,
+        tolerance=2,
+        querying=Querying(match=SequenceMatcher(5)),
+        reporting=Reporting(storage_curve=True),
+    )
     storage = found.report.as_json()["storage"]
     for key in ("map", "null", "interpolated"):
         for one in storage[key]:
@@ -102,6 +116,6 @@ def test_what_has_no_curve_is_refused(result):
 def test_what_has_no_storage_curve_is_refused():
     pair = [ArrayTraverse(route(visit), f"visit {visit}") for visit in (0, 1)]
     with refused("none to judge a storage curve by", "a truth"):
-        compare(*pair, storage_curve=True)
+        compare(*pair, reporting=Reporting(storage_curve=True))
     with refused("a storage curve of templates", "SpectralMapper"):
-        compare(*pair, "0", model=template_model(), storage_curve=True)
+        compare(*pair, "0", model=template_model(), reporting=Reporting(storage_curve=True))

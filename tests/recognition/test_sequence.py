@@ -11,6 +11,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from dejavu_torch import DejaVu, SequenceMatcher, compare
+from dejavu_torch.recognition.querying import Querying
 from dejavu_torch.types import FrequencyLayer
 
 
@@ -121,7 +122,7 @@ def test_a_sequence_finds_what_single_frames_do_not(kind):
 
 def test_a_sequence_longer_than_the_queries_is_told_once(caplog):
     model = DejaVu(whitening="none")
-    compare(route(0), route(1)[:6], "0", model, sequence=SequenceMatcher(11))
+    compare(route(0), route(1)[:6], "0", model, querying=Querying(match=SequenceMatcher(11)))
     told = [line for line in caplog.messages if "sequence" in line]
     assert told == ["a sequence of 11 queries, but there are 6: all are used"]
     SequenceMatcher(11).check(11, 11)

@@ -1,0 +1,125 @@
+"""How queries are matched, in words or by objects: the options that commands and functions share."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+from typing_extensions import Self
+
+from dejavu_torch.recognition.filter import PlaceFilter
+from dejavu_torch.recognition.sequence import SequenceMatcher
+from dejavu_torch.recognition.smoother import PlaceSmoother
+from dejavu_torch.text import refuse_with
+from dejavu_torch.types import InputError, SequenceModel, expect
+
+WAYS = "drive, filter, single or sequence:T with a whole number T of at least 1"
+
+
+@dataclass(frozen=True)
+class Sequences:
+    """How consecutive queries are matched together.
+
+    Args:
+        match: drive (each query with all others; default if in order), filter (with those before), sequence:T
+            (T queries at constant speed) or single; scores of the first two are at least -log(probability)
+        speeds: speeds of a sequence in places per query, such as '[.8,1,1.25]'; 1 if not given
+    """
+
+    match: str | SequenceModel | None = None
+    speeds: list[float] | None = None
+    sequence: int | None = None  # also spelt --match sequence:T
+    filter: bool = False  # also spelt --match filter
+
+    @property
+    def way(self) -> str | None:
+        """The way of matching, in the words of --match; None if none is given."""
+        length = self.sequence
+        if self.filter:
+            refuse_with("--filter", match=self.match, sequence=length != 1 and length)
+            return "filter"
+        if length is not None:
+            refuse_with(f"--sequence {length}", match=self.match)
+            return f"sequence:{length}"
+        if isinstance(self.match, SequenceModel):
+            return self.match.answers + f":{self.match.length}" * (self.match.answers == "sequence")
+        return self.match
+
+    def matcher(
+        self, within: int = 5, threshold: float | None = None, ordered: bool | None = None
+    ) -> SequenceModel | Literal["auto"] | None:
+        """The model that matches queries together; None for single queries.
+
+        Args:
+            within, threshold: of filter and smoother; None keeps the model's own threshold.
+            ordered: whether queries are in order, which decides if no way is given; else "auto".
+        """
+        if isinstance(self.match, SequenceModel):
+            return self.match
+        way, length = self.way, None
+        if way is not None and way.startswith("sequence:"):
+            length = way.removeprefix("sequence:")
+            expect(length.isdecimal() and len(length) < 10, WAYS, f"--match {way}")
+        elif way not in (None, "drive", "filter", "single"):
+            raise InputError(f"--match {way}; expected {WAYS}")
+        fits = self.speeds is None or length not in (None, "1")
+        expect(fits, "--match sequence:T with them", f"--speeds {self.speeds} without a sequence")
+        if length is not None:
+            matcher = SequenceMatcher(int(length), (1.0,) if self.speeds is None else self.speeds)
+            return None if matcher.length == 1 else matcher
+        if way in ("drive", "filter") or (way is None and ordered):
+            return (PlaceFilter if way == "filter" else PlaceSmoother)(within=within, threshold=threshold)
+        return "auto" if way is None and ordered is None else None
+
+    def by(self, matcher: SequenceModel | Literal["auto"] | None) -> Self:
+        """The same with a model in place of words."""
+        match = None if matcher == "auto" else "single" if matcher is None else matcher
+        return replace(self, match=match, speeds=None, sequence=None, filter=False)
+
+
+@dataclass(frozen=True)
+class Querying(Sequences):
+    """How queries are matched.
+
+    Args:
+        ordered: queries are in order, as in a video; needed for a .npy of frames
+        unordered: queries are in no order: match each by itself
+        centre: mean removes what all queries share but the map does not; default for 50 or more in order
+        top: find this many places per query, no two within the tolerance (`dejavu localize`: 5) of each
+            other, each in a row with its rank; only the first has a probability
+        loops: find where a drive returns to its own places, on a map learned from it; ignore this many frames
+            before each frame, and all after it
+        headings: on the map of an area, try this many headings of each image, evenly over 360 degrees, such
+            as 24, which takes 24 times as long
+    """
+
+    ordered: bool = False
+    unordered: bool = False
+    centre: Literal["mean", "none"] | None = None
+    top: int | None = None
+    loops: int | None = None
+    headings: int = 1
+
+    def order(self, matcher: SequenceModel | Literal["auto"] | None) -> bool | None:
+        """Whether queries, matched so, are in order; None leaves it to their source."""
+        together = isinstance(matcher, SequenceModel)
+        whole = isinstance(matcher, SequenceModel) and matcher.whole
+        if self.unordered:
+            refuse_with("--unordered", ordered=self.ordered, match=together and "drive, filter or sequence:T")
+        if self.centre == "mean" and together and not whole:
+            raise InputError("--centre mean with a filter or a sequence; expected --match drive or single")
+        return True if self.ordered or whole else False if self.unordered else None
+
+    def centres(self, default: bool) -> bool:
+        """Whether single queries and those of a drive are centred."""
+        return default if self.centre is None else self.centre == "mean"
+
+    def check_loops(self, **others: object) -> None:
+        """Refuse loops with a way of matching that they have not, and with other options."""
+        if self.loops is not None:
+            together = self.way not in (None, "drive", "single") and self.way
+            own = {"centre": self.centre, "top": self.top, "headings": self.headings != 1 and self.headings}
+            refuse_with(f"--loops {self.loops}", match=together, **own, **others)
+
+
+QUERYING = Querying()  # by the whole drive if queries are in order, else each by itself
