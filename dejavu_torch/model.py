@@ -410,7 +410,8 @@ class DejaVu(nn.Module):
         Raises:
             InputError: no map, no frames, NaN, or features of another dimension than the map's.
         """
-        return Match.joined(self.matches(queries, _querying(sequence, centre, headings), progress, search))
+        parts = [*self.matches(queries, _querying(sequence, centre, headings), progress, search)]
+        return Match.joined(parts)
 
     def localize_descriptors(
         self,
@@ -525,7 +526,7 @@ class DejaVu(nn.Module):
             descriptors = set_apart(self.map, descriptors)
         elif querying.centres(self.centres(len(descriptors))):
             descriptors = centred(self.map, descriptors)
-        yield self.localize_descriptors(descriptors, matching, progress=progress)
+        yield answer(self.scorer(descriptors, matching), matching, progress)
 
     def centres(self, queries: int) -> bool:
         """Whether so many consecutive queries are centred by default."""

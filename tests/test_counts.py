@@ -5,6 +5,9 @@ A change may do them less often, and then writes here how often.
 
 from __future__ import annotations
 
+import sys
+from pathlib import Path
+
 import pytest
 import torch
 
@@ -93,3 +96,24 @@ def test_nothing_is_done_more_often(name, counts):
     run()
     for (what, count), before in zip(counts.items(), known, strict=True):
         assert before * (1 - SLACK) <= count <= before * (1 + SLACK), what
+
+
+def test_scores_are_a_few_calls_from_localize(monkeypatch):
+    """`python -m pytest tests/test_counts.py -k few_calls`; what is between is told if it grows."""
+    between, plain = [], SpectralMap.scores
+
+    def scores(self, queries):
+        frame, calls = sys._getframe(1), []
+        while frame is not None and frame.f_code is not DejaVu.localize.__code__:
+            if "dejavu_torch" in frame.f_code.co_filename:
+                calls.append(f"{Path(frame.f_code.co_filename).name}: {frame.f_code.co_name}")
+            frame = frame.f_back
+        between[:] = max(between, calls, key=len)
+        return plain(self, queries)
+
+    learned, asked = model().learn(ROUTE[0]), open_source(ROUTE[1])[:]
+    monkeypatch.setattr(SpectralMap, "scores", scores)
+    for way, most in ((PlaceFilter(), 4), (PlaceSmoother(), 13)):
+        between.clear()
+        learned.localize(asked, sequence=way)
+        assert 0 < len(between) <= most, between[::-1]

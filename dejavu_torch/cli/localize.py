@@ -30,7 +30,7 @@ from dejavu_torch.motion.ground_plane import check_corners
 from dejavu_torch.motion.resampling import source_of
 from dejavu_torch.recognition.calibration import TOLERANCE
 from dejavu_torch.recognition.querying import Querying
-from dejavu_torch.recognition.select import check_candidates
+from dejavu_torch.recognition.select import Acceptance, check_candidates
 from dejavu_torch.recognition.smoother import PlaceSmoother
 from dejavu_torch.text import refuse_with
 from dejavu_torch.types import InputError, Match, Traverse, expect
@@ -69,7 +69,7 @@ def run_localize(
     device_of(loading.device)
     _check_written(out, pairs, map, source)
     querying.check_loops(cluster=cluster)
-    matcher, top, loops = querying.matcher(SUPPRESSION, acceptance.threshold), querying.top, querying.loops
+    matcher = querying.matcher(SUPPRESSION, acceptance.threshold)
     ordered = querying.order(matcher)
     acceptance.check(matcher)
     if cluster is not None:
@@ -82,26 +82,16 @@ def run_localize(
         why = "--as_is measures no ground" if loading.as_is else f"{map} was learned without --velocity"
         _set_corners(model, corners, why)
     acceptance.of(model)
-    if top is not None:
-        check_candidates(top, SUPPRESSION, model.map.places)
+    if querying.top is not None:
+        check_candidates(querying.top, SUPPRESSION, model.map.places)
     damaged: dict[int, str] | None = {} if skip_damaged else None
     query = _open_query(model, source, map if pairs else None, damaged)
     ordered = source_of(query).ordered if ordered is None else ordered
     if matcher == "auto":
         matcher = querying.matcher(SUPPRESSION, acceptance.threshold, ordered)
     assert not isinstance(matcher, str)
-    chosen, smooths = model.matching(matcher).acceptance, matcher is not None and matcher.whole
-    if loops is not None:
-        chosen = model.loop_matching(loops, PlaceSmoother() if smooths else None).acceptance
-        matches = iter([model.loops(query, loops, smooths, True)])
-        matcher = None
-    else:
-        alone = smooths or matcher is None
-        centre = alone and querying.centres(ordered and model.centres(len(query)))
-        asked = replace(querying.by(matcher), centre="mean" if centre else "none")
-        matches = model.matches(query, asked, True, apart=SUPPRESSION)
-    if top is not None:
-        matches = (part.map(Tensor.flatten) for part in matches)
+    asked = replace(querying.by(matcher), ordered=ordered)
+    matches, chosen = _found(model, query, asked)
     counts, lost = Counter[str](), set[bool]()
 
     def counted() -> Iterator[Match]:
@@ -116,22 +106,37 @@ def run_localize(
 
             workers = stack.enter_context(Cluster(cluster))
             model.searcher = ClusterSearch(workers, model.map, searching.search, searching.bytes)
-        total, accepted = write_matches(out, counted(), query, model, top, pairs)
+        total, accepted = write_matches(out, counted(), query, model, querying.top, pairs)
     if not model.map.summary().covered:
         print("the map has no layers, so no place can be reported")
     elif not chosen.given:
         print(chosen)
-    if loops is None and any(lost):
+    if querying.loops is None and any(lost):
         print(NO_DRIVE)
     if damaged:
         one, many = min(damaged), len(damaged)
         print(f"{many} frame{'s' * (many > 1)} could not be read, such as {one}: {damaged[one]}")
     say(f"{total} queries, {accepted} accepted; written to {out}")
     if counts:
-        steps = next_steps(matcher is not None, chosen.given)
+        steps = next_steps(matcher is not None and querying.loops is None, chosen.given)
         probable = f"{describe_probable(counts, total)}, of being within {TOLERANCE} places"
         say(probable + (f"; next: {'; '.join(steps)}" if steps else ""))
     _print_evaluate(out, model, map, source if query.coordinates is not None else "SOURCE")
+
+
+def _found(model: DejaVu, query: Traverse, querying: Querying) -> tuple[Iterator[Match], Acceptance]:
+    """The matches of a query, of which candidates follow each other, and how they are accepted."""
+    matcher, top = querying.matcher(), querying.top
+    assert not isinstance(matcher, str)
+    smooths, acceptance = matcher is not None and matcher.whole, model.matching(matcher).acceptance
+    if querying.loops is not None:
+        acceptance = model.loop_matching(querying.loops, PlaceSmoother() if smooths else None).acceptance
+        return iter([model.loops(query, querying.loops, smooths, True)]), acceptance
+    centre = smooths or matcher is None
+    centre &= querying.centres(querying.ordered and model.centres(len(query)))
+    querying = replace(querying, centre="mean" if centre else "none")
+    matches = model.matches(query, querying, True, apart=SUPPRESSION)
+    return matches if top is None else (part.map(Tensor.flatten) for part in matches), acceptance
 
 
 def _print_evaluate(out: Path, model: DejaVu, map: Path, source: str) -> None:

@@ -42,7 +42,7 @@ from dejavu_torch.evaluation.options import (
 )
 from dejavu_torch.evaluation.pictures import draw_compared, draw_pictures
 from dejavu_torch.evaluation.plots import Pictures
-from dejavu_torch.evaluation.rejection import draw_reliability, reach_of
+from dejavu_torch.evaluation.rejection import draw_reliability, found_elsewhere, reach_of
 from dejavu_torch.evaluation.report import Report, as_html
 from dejavu_torch.evaluation.storage import coded_at_sizes, noise_over_map
 from dejavu_torch.features.descriptor import is_ready
@@ -52,8 +52,7 @@ from dejavu_torch.maps.spectral_map import SpectralMap
 from dejavu_torch.model import DejaVu, check_apart, check_loops_along, check_queries, features_per_frame
 from dejavu_torch.motion.resampling import ground_truth_of, resampled, source_of
 from dejavu_torch.places.layout import Reach
-from dejavu_torch.recognition.calibration import TOLERANCE
-from dejavu_torch.recognition.centring import centred, set_apart
+from dejavu_torch.recognition.centring import centred
 from dejavu_torch.recognition.localizer import Matching, answer
 from dejavu_torch.recognition.querying import QUERYING, Querying
 from dejavu_torch.recognition.select import check_candidates
@@ -122,6 +121,25 @@ class Plan(NamedTuple):
         default = self.ordered and self.model.centres(len(self.query))
         return self.querying.loops is None and self.querying.centres(default)
 
+    def within(self, truth: GroundTruth | None) -> int:
+        """Within how many places answers are right, for all probabilities, by a truth in places."""
+        return reach_of(self.reach.within, truth, self.near or self.reach.radius > 0)
+
+    def ways(self, run: Localization) -> tuple[Matching, PlaceSmoother | None, PlaceSmoother | None]:
+        """How queries are matched without a whole drive: the way that answers, and those that are compared;
+        the smoother of a drive that answers, and one that is only compared."""
+        queries, places, reach = len(self.query), self.model.map.places, self.within(run.truth)
+        way, dimensions = self.way and self.way.having(within=reach), self.reference.layout.dimensions
+        whole = way if isinstance(way, PlaceSmoother) else None
+        # compared are single headings of queries in order, on few scores unless the user has asked for them
+        most = math.inf if self.given else MOST[dimensions]
+        wanted = self.ordered and run.truth is not None and self.querying.loops is None
+        beside = wanted and self.querying.headings == 1 and queries * places <= most
+        also = models_beside(None if whole else way, beside, queries, places, reach)
+        also = {key: one for key, one in also.items() if key == "filter" or FOLLOWS[dimensions]}
+        matching = run.matching._replace(sequence=None if whole else way, also=also)
+        return matching, whole, PlaceSmoother(within=reach) if beside and queries > 1 else None
+
 
 def compare(
     reference: Source,
@@ -159,9 +177,10 @@ def compare(
     plan = _planned(reference, query, truth, model, tolerance, learning, querying, reporting)
     with model.descriptor.setting_aside(*([] if plan.known is None else [plan.reference, plan.query])):
         run = _learned(plan)
-        with _calibrated(plan, run):
+        with learning.calibrated(model, plan.reference, plan.within(run.truth), reporting.progress):
             run, candidates = _answered(plan, run)
-            off_map = _match_distractors(plan, run)
+            way = plan.way and plan.way.having(within=plan.within(run.truth))
+            off_map = found_elsewhere(run, plan.off, way, plan.centring, reporting.progress)
         model.cpu()
         found = _told(plan, run, candidates, off_map)
         if reporting.on_found is not None:
@@ -298,53 +317,10 @@ def _learned(plan: Plan) -> Localization:
     return run._replace(matching=matching, radius=plan.reach.radius)
 
 
-@contextmanager
-def _calibrated(plan: Plan, run: Localization) -> Iterator[None]:
-    """Within the block a calibrated model is calibrated for the reach, if there is what to do it by."""
-    model, reach, visit = plan.model, _within(plan, run), plan.learning.visit
-    held = model.calibration
-    try:
-        if held is not None and reach != TOLERANCE:
-            model.calibration = None
-            # a visit says how sure it is within 5
-            if plan.learning.calibration != NO_CALIBRATION and not isinstance(visit, Traverse):
-                progress = plan.reporting.progress
-                calibrate_if_possible(model, plan.reference, visit, progress=progress, reach=reach)
-            if model.calibration is None:
-                model.calibration = held
-                line = "the map gives probabilities of being within %d places; here one is right within %d"
-                log.warning(line, TOLERANCE, reach)
-        yield
-    finally:
-        model.calibration = held
-
-
-def _within(plan: Plan, run: Localization) -> int:
-    """Within how many places answers are right, for the probabilities of all ways."""
-    return reach_of(plan.reach.within, run.truth, plan.near or plan.reach.radius > 0)
-
-
-def _ways(plan: Plan, run: Localization) -> tuple[Matching, PlaceSmoother | None, PlaceSmoother | None]:
-    """How queries are matched without a whole drive: the way that answers, and those that are compared; the
-    smoother of a drive that answers, and one that is only compared."""
-    places, reach, querying = run.model.map.places, _within(plan, run), plan.querying
-    way = plan.way and plan.way.having(within=reach)
-    whole = way if isinstance(way, PlaceSmoother) else None
-    dimensions, queries = run.model.map.layout.dimensions, len(plan.query)
-    # compared are single headings of queries in order, on few scores unless the user has asked for them
-    most = math.inf if plan.given else MOST[dimensions]
-    wanted = plan.ordered and run.truth is not None and querying.loops is None and querying.headings == 1
-    beside = wanted and queries * places <= most
-    also = models_beside(None if whole else way, beside, queries, places, reach)
-    also = {key: one for key, one in also.items() if key == "filter" or FOLLOWS[dimensions]}
-    matching = run.matching._replace(sequence=None if whole else way, also=also)
-    return matching, whole, PlaceSmoother(within=reach) if beside and queries > 1 else None
-
-
 def _answered(plan: Plan, run: Localization) -> tuple[Localization, Match]:
     """The run with its answers, and the best places of each query, as far as recall@N or `top` needs."""
     model, querying, progress = plan.model, plan.querying, plan.reporting.progress
-    matching, whole, beside = _ways(plan, run)
+    matching, whole, beside = plan.ways(run)
     run = run._replace(matching=matching, beside=beside)
     way, loops, places = run.sequence, querying.loops, model.map.places
     ranks = max(querying.top or 1, min(max(RANKS), places))
@@ -376,27 +352,6 @@ def _answered(plan: Plan, run: Localization) -> tuple[Localization, Match]:
             if whole is not None:
                 run, found = run._replace(match=best), drive
     return run, found
-
-
-def _match_distractors(plan: Plan, run: Localization) -> dict[str, Tensor]:
-    """The probability of the match of each frame of other routes, (n,) by name."""
-    model, probabilities = plan.model, {}
-    way = plan.way and plan.way.having(within=_within(plan, run))
-    if plan.off and not ((way and way.whole) or model.matching(way).platt):
-        log.warning("the map is not calibrated, so no frame of other routes has a probability")
-        return {}
-    for other in plan.off:
-        asked = facing_north(other, model.map.layout, plan.querying.headings)
-        queries = model.descriptor.all_of(asked, plan.reporting.progress)
-        if isinstance(asked, Turned):
-            queries = set_apart(model.map, queries)
-        elif plan.centring and (way is None or way.whole):
-            queries = centred(model.map, queries)
-        matching = model.matching(way)._replace(copies=plan.querying.headings)
-        match = model.localize_descriptors(queries, matching)
-        assert match.probability is not None
-        probabilities[other.name] = match.probability
-    return probabilities
 
 
 def _told(plan: Plan, run: Localization, candidates: Match, off_map: dict[str, Tensor]) -> Comparison:

@@ -161,9 +161,7 @@ def evaluate_file(
     match = replace(match, index=candidates[:, 0])
     reach = reach_of(tolerance, known, near is not None)
     if match.probability is not None and reach != TOLERANCE:
-        line = (
-            "probabilities that `localize` writes are of being within %d places; here one is right within %d"
-        )
+        line = "probabilities of `localize` are of being within %d places; here right is within %d"
         log.warning(line, TOLERANCE, reach)
     described = describe_ground_truth(truth, interpolate, carried)
     facts = evaluation_facts(match, candidates, known, tolerance, positions, described) | alone

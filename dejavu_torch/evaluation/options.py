@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+import logging
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, TypeVar
@@ -18,9 +20,12 @@ from dejavu_torch.maps.spectral_map import SpectralMap
 from dejavu_torch.maps.template_map import TemplateMapper
 from dejavu_torch.model import DejaVu
 from dejavu_torch.motion.resampling import source_of
+from dejavu_torch.recognition.calibration import TOLERANCE
 from dejavu_torch.recognition.querying import Querying
 from dejavu_torch.recognition.scorer import Scorer
 from dejavu_torch.types import InputError, Traverse, expect
+
+log = logging.getLogger("dejavu_torch")
 
 NO_CALIBRATION = "none"
 UNREAD = (None, NO_CALIBRATION)  # values of --calibration that name no source
@@ -97,6 +102,24 @@ class Learning:
             visit = growth.visit_to_calibrate(model, reference, other, self.calibration_truth)
             opened = replace(opened, calibration=visit)
         return reference, opened
+
+    @contextmanager
+    def calibrated(self, model: DejaVu, reference: Traverse, reach: int, progress: bool) -> Iterator[None]:
+        """Within the block a calibrated model is calibrated for a reach, if there is what to do it by."""
+        held, visit = model.calibration, self.visit
+        try:
+            if held is not None and reach != TOLERANCE:
+                model.calibration = None
+                # a visit says how sure it is within 5
+                if self.calibration != NO_CALIBRATION and not isinstance(visit, Traverse):
+                    growth.calibrate_if_possible(model, reference, visit, progress=progress, reach=reach)
+                if model.calibration is None:
+                    model.calibration = held
+                    line = "the map tells probabilities of being within %d places; right is within %d"
+                    log.warning(line, TOLERANCE, reach)
+            yield
+        finally:
+            model.calibration = held
 
     def check_calibrated(
         self, model: DejaVu, traverse: Traverse, map: Path | None = None, distractors: object = None

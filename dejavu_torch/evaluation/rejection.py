@@ -2,22 +2,30 @@
 
 from __future__ import annotations
 
+import logging
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
 from dejavu_torch.data.ground_truth import GroundTruth, scored_and_right
+from dejavu_torch.data.turning import Turned, facing_north
 from dejavu_torch.evaluation.activation import share
 from dejavu_torch.evaluation.curves import evaluate
 from dejavu_torch.evaluation.plots import DARK, GREY, RIGHT, Pictures, canvas, picture
 from dejavu_torch.memory import in_float32
 from dejavu_torch.recognition.calibration import TOLERANCE
-from dejavu_torch.types import Facts, Match
+from dejavu_torch.recognition.centring import centred, set_apart
+from dejavu_torch.types import Facts, Match, SequenceModel, Traverse
+
+if TYPE_CHECKING:
+    from dejavu_torch.evaluation.localization import Localization
+
+log = logging.getLogger("dejavu_torch")
 
 ASKED = (0.5, 0.8, 0.9, 0.95, 0.99)  # precisions in a report
 BINS = 10
@@ -43,6 +51,28 @@ def reach_of(tolerance: int, truth: GroundTruth | None, near: bool = False) -> i
     begins = F.pad((places.diff(dim=1) > 1) | (places[:, :-1] < 0), (1, 0), value=True)
     stretch = (places - places.where(begins, -1).cummax(1).values).amax(1)
     return math.ceil(stretch.median() / 2) or (1 if near else TOLERANCE)
+
+
+def found_elsewhere(
+    run: Localization, off: Sequence[Traverse], way: SequenceModel | None, centring: bool, progress: bool
+) -> dict[str, Tensor]:
+    """The probability of the match of each frame of routes off the map, (n,) by name; none without a
+    calibration."""
+    model, copies, probabilities = run.model, run.matching.copies, {}
+    if off and not ((way and way.whole) or model.matching(way).platt):
+        log.warning("the map is not calibrated, so no frame of other routes has a probability")
+        return {}
+    for other in off:
+        asked = facing_north(other, model.map.layout, copies)
+        queries = model.descriptor.all_of(asked, progress)
+        if isinstance(asked, Turned):
+            queries = set_apart(model.map, queries)
+        elif centring and (way is None or way.whole):
+            queries = centred(model.map, queries)
+        match = model.localize_descriptors(queries, model.matching(way)._replace(copies=copies))
+        assert match.probability is not None
+        probabilities[other.name] = match.probability
+    return probabilities
 
 
 def rejection_facts(

@@ -8,7 +8,7 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from dejavu_torch.evaluation.baselines import as_int8, interpolated, nearest_frames
+from dejavu_torch.evaluation.baselines import INTERPOLATES, as_int8, interpolated, nearest_frames
 from dejavu_torch.evaluation.contenders import evaluate_each
 from dejavu_torch.evaluation.controls import shuffled, with_mapper
 from dejavu_torch.evaluation.curves import evaluate
@@ -16,8 +16,7 @@ from dejavu_torch.evaluation.localization import Localization
 from dejavu_torch.evaluation.score_plots import Stored
 from dejavu_torch.maps.spectral import SpectralMapper
 from dejavu_torch.maps.spectral_map import SpectralMap
-from dejavu_torch.maps.spectrum import from_spectrum, spectrum
-from dejavu_torch.recognition.localizer import SINGLE
+from dejavu_torch.maps.spectrum import from_lines, lines_of
 from dejavu_torch.recognition.scorer import Reordered
 from dejavu_torch.text import with_progress
 from dejavu_torch.types import InputError, Match
@@ -39,7 +38,8 @@ def coded_at_sizes(
     Raises:
         InputError: the map is not spectral, or there is no ground truth.
     """
-    matching = SINGLE if run.sequence is None else run.matching  # without a filter for each size
+    # without a filter for each size
+    matching = run.matching._replace(also={}) if run.sequence is None else run.matching
     queries = run.query_features if run.sequence is None else run.causal_features
     run = run._replace(matching=matching, query_features=run.query_features if queries is None else queries)
     place_map = run.model.map
@@ -55,6 +55,8 @@ def coded_at_sizes(
         "interpolated": partial(_keyframes, run, place_map),
     }
     found: dict[str, list[Stored]] = {key: [] for key in kinds}
+    if not INTERPOLATES[place_map.layout.dimensions]:
+        del kinds["interpolated"]
     cases = [(key, budget) for key in kinds for budget in budgets]
     for key, budget in with_progress(cases, "storage", progress):
         for answers, size in kinds[key](budget):
@@ -66,23 +68,24 @@ def coded_at_sizes(
 
 
 def noise_over_map(place_map: SpectralMap, features: Tensor, seed: int = 0) -> float:
-    """Bytes of noise as smooth as the route, coded in the map's steps, divided by those of the map.
+    """Bytes of noise as smooth as the map's route or area, of one chunk, coded in its steps, divided by those
+    of the map.
 
     The noise is Gaussian with the spectrum of each descriptor dimension, averaged over half octaves, so that
     nothing in it repeats. The difference is an upper bound of what the map saves by repetition: a trend, or a
     segment with less energy than others, saves bytes too. All other savings come from smoothness.
     """
-    lines = spectrum((features.float() - place_map.means[0].float()).T, place_map.transform)
+    (_, columns), *_ = place_map.layout.sizes(place_map.chunk)
+    lines = lines_of((features.float() - place_map.means[0].float()).T, columns, place_map.transform)
     band = (2 * torch.arange(1, lines.shape[1] + 1, device=lines.device).float().log2()).long()
     sums = lines.new_zeros(len(lines), int(band[-1]) + 1).index_add(1, band, lines.square())
     energy = (sums / band.bincount().clamp(min=1))[:, band]
     normal = torch.randn(lines.shape, dtype=torch.float32, generator=torch.Generator().manual_seed(seed))
-    noise = (
-        from_spectrum(energy.sqrt() * normal.to(energy), place_map.transform).T + place_map.means[0].float()
-    )
+    noise = from_lines(energy.sqrt() * normal.to(energy), columns, place_map.transform).T
     settings = place_map.chunk, place_map.transform, place_map.metric, place_map.resolution
     mapper = SpectralMapper(None, float(place_map.steps.mean()), *settings)
-    packed = [one.packed() for one in (mapper(noise), place_map)]
+    coded = mapper(noise + place_map.means[0].float(), place_map.layout)
+    packed = [one.packed() for one in (coded, place_map)]
     taken = [one["streams"].nbytes + one["means"].nbytes for one in packed]
     return taken[0] / taken[1]
 

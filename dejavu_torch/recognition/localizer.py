@@ -17,7 +17,7 @@ from dejavu_torch.memory import in_one_thread
 from dejavu_torch.places.layout import ROUTE, Layout
 from dejavu_torch.recognition.calibration import TOLERANCE, Platt, Track, best_pair, confidence_of
 from dejavu_torch.recognition.calibration import confidence as confidence_of_pair
-from dejavu_torch.recognition.drive import DriveQuery, first_of, localize_drive
+from dejavu_torch.recognition.drive import DriveQuery, answer_drives, first_of
 from dejavu_torch.recognition.scorer import BestOf, Earlier, OfMap, Scorer, of_stored
 from dejavu_torch.recognition.search import Search, Searcher
 from dejavu_torch.recognition.select import Acceptance, accept, best_candidates, best_match
@@ -323,7 +323,8 @@ def _of_drive(scorer: Scorer, smoother: PlaceSmoother, matching: Matching, progr
     """Match all queries of a drive."""
     scorer, checks = wrapped(scorer, matching), matching.apart is not None
     asked = DriveQuery(scorer, smoother, matching.k or 1, matching.radius, matching.platt, checks)
-    match, acceptance = localize_drive(asked, progress), matching.acceptance
+    (answers,) = answer_drives([asked], progress)
+    match, acceptance = answers.match, matching.acceptance
     # whose scores are distances
     if acceptance.threshold is not None and not match.is_drive and not checks:
         acceptance = Acceptance(precision=math.exp(-acceptance.threshold))
