@@ -177,7 +177,7 @@ def compare(
     plan = _planned(reference, query, truth, model, tolerance, learning, querying, reporting)
     with model.descriptor.setting_aside(*([] if plan.known is None else [plan.reference, plan.query])):
         run = _learned(plan)
-        with learning.calibrated(model, plan.reference, plan.within(run.truth), reporting.progress):
+        with plan.learning.calibrated(model, plan.reference, plan.within(run.truth), reporting.progress):
             run, candidates = _answered(plan, run)
             way = plan.way and plan.way.having(within=plan.within(run.truth))
             off_map = found_elsewhere(run, plan.off, way, plan.centring, reporting.progress)
