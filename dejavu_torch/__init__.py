@@ -22,6 +22,8 @@ Supportive Feature Frequencies" (IROS 2017). From the paper's sections to the co
            (ours) few, distinctive dimensions    Whitening           features.whitening
     IV-C   precision, recall, area               evaluate            evaluation.curves
     V      (ours) with baselines and nulls       compare             evaluation.compare
+           what it learns from and reports       Learning, Reporting evaluation.options
+           how its queries are matched           Querying            recognition.querying
     VI     (ours) several consecutive queries    SequenceMatcher     recognition.sequence
     VI     (ours) probabilities along the way    PlaceFilter         recognition.filter
     VI     (ours) given the whole drive          PlaceSmoother       recognition.smoother
@@ -44,6 +46,8 @@ if TYPE_CHECKING:
     from dejavu_torch.data.source import open_source as open_source
     from dejavu_torch.evaluation.compare import compare as compare
     from dejavu_torch.evaluation.curves import evaluate as evaluate
+    from dejavu_torch.evaluation.options import Learning as Learning
+    from dejavu_torch.evaluation.options import Reporting as Reporting
     from dejavu_torch.features.embedding import Embedding as Embedding
     from dejavu_torch.features.hog import HOG as HOG
     from dejavu_torch.features.hog import hog as hog
@@ -63,6 +67,7 @@ if TYPE_CHECKING:
     from dejavu_torch.periods.spectrogram import SpectrogramAnalysis as SpectrogramAnalysis
     from dejavu_torch.places.layout import Layout as Layout
     from dejavu_torch.recognition.filter import PlaceFilter as PlaceFilter
+    from dejavu_torch.recognition.querying import Querying as Querying
     from dejavu_torch.recognition.select import best_match as best_match
     from dejavu_torch.recognition.sequence import SequenceMatcher as SequenceMatcher
     from dejavu_torch.recognition.smoother import PlaceSmoother as PlaceSmoother
@@ -79,6 +84,7 @@ _NAMES = {
     "data.source": "open_source",
     "evaluation.compare": "compare",
     "evaluation.curves": "evaluate",
+    "evaluation.options": "Learning Reporting",
     "features.embedding": "Embedding",
     "features.hog": "HOG hog",
     "features.preprocess": "Preprocess",
@@ -95,6 +101,7 @@ _NAMES = {
     "periods.spectrogram": "SpectrogramAnalysis",
     "places.layout": "Layout",
     "recognition.filter": "PlaceFilter",
+    "recognition.querying": "Querying",
     "recognition.select": "best_match",
     "recognition.sequence": "SequenceMatcher",
     "recognition.smoother": "PlaceSmoother",

@@ -465,7 +465,8 @@ class DejaVu(nn.Module):
         single = self.matching(None)
         drive = single if smoother is None else self.matching(smoother)
         acceptance = single.acceptance if single.acceptance.given else drive.acceptance
-        return single._replace(sequence=drive.sequence, apart=apart, acceptance=acceptance)
+        wrappers = Querying(loops=apart).wrappers
+        return single._replace(sequence=drive.sequence, wrappers=wrappers, acceptance=acceptance)
 
     def localizer(self, matching: Matching) -> Localizer:
         """A matcher of descriptors, for consecutive batches of queries."""
@@ -502,7 +503,8 @@ class DejaVu(nn.Module):
         queries = self.at_map_size(as_traverse(queries), self.frame_shape or ())
         sequence, headings = querying.matcher(ordered=queries.ordered), querying.headings
         assert not isinstance(sequence, str)
-        matching = self.matching(sequence, search)._replace(k=querying.top, radius=apart, copies=headings)
+        matching = self.matching(sequence, search)
+        matching = matching._replace(k=querying.top, radius=apart, wrappers=querying.wrappers)
         localizer = self.localizer(matching)
         if sequence is not None:
             sequence.check(len(queries), self.map.places)

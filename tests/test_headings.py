@@ -81,14 +81,15 @@ def test_the_best_of_all_copies_is_the_minimum_of_their_scores(model, images):
         scores = model.map.scores(rows).view(6, 4, -1)
     expected = best_candidates(scores.amin(1), 4, 2, layout=model.map.layout)
     for search in ("auto", "scan"):
-        matching = Matching(k=4, radius=2, copies=4, search=search)
+        matching = Matching(k=4, radius=2, wrappers=Querying(headings=4).wrappers, search=search)
         match = model.localize_descriptors(rows, matching)
         assert torch.equal(match.index, expected.index)
         assert torch.allclose(match.score, expected.score, atol=1e-4)
         at = expected.index[:, None].expand(-1, 4, -1)
         assert torch.equal(match.heading, 90.0 * scores.gather(2, at).argmin(1))
     none = answer(
-        OfRows(lambda numbers: torch.full((2, 5), math.inf), rows[:2], Layout(5)), Matching(copies=2)
+        OfRows(lambda numbers: torch.full((2, 5), math.inf), rows[:2], Layout(5)),
+        Matching(wrappers=Querying(headings=2).wrappers),
     )
     assert none.index.tolist() == [-1]
     assert none.heading.isnan().all()
@@ -214,14 +215,15 @@ def test_what_cannot_be_turned_is_refused(model, ground, images):
     rows = model.descriptor.describe(images)
     with refused("headings 4, and the array has ready features; expected images, which can be turned"):
         model.localize(rows, headings=4)
-    with refused("loops 3 and headings 4; expected one of them"):
+    with refused("--loops 3 and --headings 4; expected one of them"):
         compare(ground, None, querying=Querying(loops=3, headings=4))
     with refused("loops on the map of an area; expected a route"):
         model.loops(ground)
     with refused("loops on the map of an area; expected a route"):
         compare(ground, None, querying=Querying(loops=3))
-    with refused("a storage curve and headings 4; expected one of them"):
-        compare(ground, images, querying=Querying(headings=4), reporting=Reporting(storage_curve=True))
+    reporting = Reporting(storage_curve=True, drives="all")
+    with refused("there is none to judge a storage curve by"):
+        compare(ground, images, querying=Querying(headings=4), reporting=reporting)
 
 
 def test_commands_try_headings(tmp_path, model, ground, images, capsys):

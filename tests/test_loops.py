@@ -104,9 +104,9 @@ def test_a_comparison_of_loops_asks_all_contenders_for_them(tmp_path, capsys):
         assert f"--loops 30 and {option}" in failed
     with refused("expected a second visit, or loops"):
         compare(twice(), None)
-    with refused("without query"):
+    with refused("--loops 5 and a query; expected the reference alone"):
         compare(twice(), twice(), querying=Querying(loops=5))
-    with refused("expected a smoother"):
+    with refused("--loops 5 and --match filter; expected one of them"):
         compare(twice(), None, querying=Querying(loops=5, match=PlaceFilter()))
 
 

@@ -137,7 +137,7 @@ class Plan(NamedTuple):
         beside = wanted and self.querying.headings == 1 and queries * places <= most
         also = models_beside(None if whole else way, beside, queries, places, reach)
         also = {key: one for key, one in also.items() if key == "filter" or FOLLOWS[dimensions]}
-        matching = run.matching._replace(sequence=None if whole else way, also=also)
+        matching = Matching(None if whole else way, also, wrappers=self.querying.wrappers)
         return matching, whole, PlaceSmoother(within=reach) if beside and queries > 1 else None
 
 
@@ -215,16 +215,17 @@ def _planned(
     check_candidates(querying.top or 1, tolerance)
     reporting.check(model, querying)
     itself, headings = querying.loops is not None, querying.headings
-    seen = f"the query is {query}, and loops are {querying.loops}"
-    expect((query is None) == itself, "a second visit, or loops within the reference", seen)
+    expect(query is not None or itself, "a second visit, or loops within the reference", "there is no query")
+    expect(query is None or not itself, "the reference alone", f"--loops {querying.loops} and a query")
     way = querying.matcher(tolerance)
     ordered = querying.order(way)
     # descriptors are as wide as the map's, and both traverses as evenly stepped
     seconds = dict.fromkeys(("describe", "learn", "localize"), 0.0)
     has_map = model.map.places > 0
-    sources = as_traverse(reference), None if query is None else as_traverse(query)
-    first, learning = learning.opened(model, *sources)
-    reference, query, off = _prepared(model, first, sources[1], querying, reporting, seconds)
+    first, same = as_traverse(reference), query is reference
+    second = first if same else None if query is None else as_traverse(query)
+    first, learning = learning.opened(model, first, second)
+    reference, query, off = _prepared(model, first, first if same else second, querying, reporting, seconds)
     check_candidates(querying.top or 1, tolerance, len(reference))
     layout = reference.layout
     north = facing_north(query, layout, headings)  # pictures show images, not their copies
@@ -313,8 +314,7 @@ def _learned(plan: Plan) -> Localization:
         known = known if loops is None else of_loops(known, torch.arange(len(plan.query)), loops)
     check_queries(model, plan.query.frame_shape, features_per_frame(model), plan.query.name)
     run = Localization(model, reference, plan.query, places, places, NOTHING, known, plan.reach.tolerance)
-    matching = Matching(apart=loops, copies=plan.querying.headings)
-    return run._replace(matching=matching, radius=plan.reach.radius)
+    return run._replace(querying=plan.querying, radius=plan.reach.radius)
 
 
 def _answered(plan: Plan, run: Localization) -> tuple[Localization, Match]:
@@ -335,15 +335,14 @@ def _answered(plan: Plan, run: Localization) -> tuple[Localization, Match]:
         # whose acceptance is not asked for beside a drive
         own = Matching(way, platt=model.calibration and model.calibration.of(way))
         own = own if whole else model.matching(way)
-        own = own._replace(also=matching.also, apart=loops, copies=querying.headings)
-        own = own._replace(k=ranks, radius=run.tolerance)
+        own = own._replace(also=matching.also, k=ranks, radius=run.tolerance, wrappers=querying.wrappers)
         scorer = run.scorer_by(partial(model.scorer, matching=own))
         found = answer(scorer, own, progress)
         best = found.map(lambda column: column[:, 0])
         run = run._replace(match=best, judged=best)
         if (smoother := whole or beside) is not None:
             own = model.matching(smoother) if loops is None else model.loop_matching(loops, smoother)
-            own = own._replace(k=ranks, radius=run.tolerance, copies=querying.headings)
+            own = own._replace(k=ranks, radius=run.tolerance, wrappers=querying.wrappers)
             drive = answer(scorer, own, progress)
             best, removed = drive.map(lambda column: column[:, 0]), getattr(own.sequence, "removed", 1.0)
             if loops is None:

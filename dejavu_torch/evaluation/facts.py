@@ -81,8 +81,8 @@ def _run_facts(run: Localization, seconds: Mapping[str, float]) -> Facts:
         if run.truth is not None:
             block = math.ceil(drive["correlation"])
             drive["auc_error"] = auc_error(run.scored, run.truth, run.tolerance, block)
-    if run.matching.apart is not None:
-        facts["loops"] = run.matching.apart
+    if run.querying.loops is not None:
+        facts["loops"] = run.querying.loops
     if isinstance(reference, ResampledTraverse):
         facts["resampling"] = {
             "step": reference.step,
@@ -102,7 +102,7 @@ def match_facts(
     ranked, shown = place_map.table.scored(candidates.index), run.match.renumbered(place_map.frame_of)
     facts = evaluation_facts(run.scored, ranked, run.truth, tolerance, place_map.positions, words, off)
     alone = answer_facts(shown, run.query_frames, tolerance, run.truth is not None, offset)
-    if run.matching.apart is not None or not LINES[place_map.layout.dimensions]:
+    if run.querying.loops is not None or not LINES[place_map.layout.dimensions]:
         alone.pop("line", None)  # a second lap lies on one
     if extent := place_map.layout.extent:
         radius, unit = run.reach
@@ -123,7 +123,7 @@ def metric_facts(run: Localization, truth: Truth | None) -> Facts:
     asked, found = asked[run.query_frames], stored[run.model.map.frame_of(index)]
     distance = (asked - found).norm(dim=1)
     known = distance.isfinite() & (index >= 0)
-    if run.truth is not None and run.matching.apart is not None:
+    if run.truth is not None and run.querying.loops is not None:
         known &= (run.truth.positives >= 0).any(1)  # most places are no loop
     facts: Facts = {}
     for name, chosen in (("all", known), ("accepted", known & run.match.accepted)):
@@ -135,7 +135,7 @@ def metric_facts(run: Localization, truth: Truth | None) -> Facts:
         asked_of, far = asked.isfinite().all(1), distance.masked_fill(~known, math.inf)
         near = {f"{radius:g}": float((far[asked_of] <= radius).double().mean()) for radius in radii}
         shares = {"recall_within": near} if asked_of.any() else {}
-    if run.matching.apart is None:
+    if run.querying.loops is None:
         shares |= shift_facts(parsed, run.match, found, asked)
     return {f"error_{parsed.kind if parsed.kind == 'pixels' else 'metres'}": facts} | shares
 
@@ -144,7 +144,7 @@ def _gap_facts(run: Localization) -> Facts:
     """Of queries in order: the longest stretch without an accepted answer, in frames and, if known, seconds
     from the answer before to that after."""
     in_order = run.query.ordered or run.match.smoother is not None or run.sequence is not None
-    if not in_order or run.matching.apart is not None:
+    if not in_order or run.querying.loops is not None:
         return {}
     ends, count = (run.match.accepted & (run.match.index >= 0)).nonzero()[:, 0].tolist(), len(run.match.index)
     gap, before, after = max((two - one - 1, one, two) for one, two in pairwise([-1, *ends, count]))

@@ -16,6 +16,7 @@ from dejavu_torch.motion.resampling import ResampledTraverse
 from dejavu_torch.places.positions import unit_of
 from dejavu_torch.recognition.centring import set_apart
 from dejavu_torch.recognition.localizer import SINGLE, Matching, wrapped
+from dejavu_torch.recognition.querying import QUERYING, Querying
 from dejavu_torch.recognition.scorer import OfMap, Scorer
 from dejavu_torch.recognition.smoother import PlaceSmoother
 from dejavu_torch.types import Match, SequenceModel, Traverse
@@ -28,9 +29,9 @@ class Localization(NamedTuple):
 
     reference_features (N,D) and query_features (Q,D), or those of all turned copies, may lie in a file.
     truth: None if unknown. tolerance: in places, inclusive. matching: for the map and all baselines.
-    causal_features: the queries for sequences and filters, if query_features are centred, which takes all
-    of them. match: the answers. judged: the matches that the scores at top level judge, with those of
-    other models. beside: a smoother to compare all contenders by, if any. radius: over an area, the distance
+    querying: as asked for. causal_features: the queries for sequences and filters, if query_features are
+    centred, which takes all of them. match: the answers. judged: the matches that the scores at top level
+    judge, with those of other models. beside: a smoother to compare all contenders by, if any. radius: over an area, the distance
     within which a match is right, in the unit of its coordinates; tolerance is 0. Along a route the tolerance
     once more.
 
@@ -46,6 +47,7 @@ class Localization(NamedTuple):
     truth: GroundTruth | None
     tolerance: int
     matching: Matching = SINGLE
+    querying: Querying = QUERYING
     causal_features: Tensor | None = None
     judged: Match = NOTHING
     beside: PlaceSmoother | None = None
@@ -67,7 +69,7 @@ class Localization(NamedTuple):
     @property
     def asked(self) -> Traverse:
         """The frames whose descriptors the queries have: all turned copies, if several headings are tried."""
-        return facing_north(self.query, self.model.map.layout, self.matching.copies)
+        return facing_north(self.query, self.model.map.layout, self.querying.headings)
 
     def described_by(self, model: DejaVu, progress: bool = False) -> Tensor:
         """The descriptors of the queries by a model, those of turned images by `set_apart`."""
@@ -87,7 +89,7 @@ class Localization(NamedTuple):
     @property
     def answers(self) -> str:
         """How the answers were found: loops, drive, filter, sequence or single."""
-        if self.matching.apart is not None:
+        if self.querying.loops is not None:
             return "loops"
         if self.match.smoother is not None:
             return "drive" if self.match.is_drive else "single"
@@ -114,7 +116,7 @@ class Localization(NamedTuple):
         """(Q,) the frame of its source that each query shows."""
         if isinstance(self.query, ResampledTraverse):
             return self.query.frame
-        return torch.arange(len(self.query_features) // self.matching.copies)
+        return torch.arange(len(self.query_features) // self.querying.headings)
 
     @property
     def unit(self) -> str:

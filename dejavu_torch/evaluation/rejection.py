@@ -58,18 +58,19 @@ def found_elsewhere(
 ) -> dict[str, Tensor]:
     """The probability of the match of each frame of routes off the map, (n,) by name; none without a
     calibration."""
-    model, copies, probabilities = run.model, run.matching.copies, {}
+    model, probabilities = run.model, {}
     if off and not ((way and way.whole) or model.matching(way).platt):
         log.warning("the map is not calibrated, so no frame of other routes has a probability")
         return {}
     for other in off:
-        asked = facing_north(other, model.map.layout, copies)
+        asked = facing_north(other, model.map.layout, run.querying.headings)
         queries = model.descriptor.all_of(asked, progress)
         if isinstance(asked, Turned):
             queries = set_apart(model.map, queries)
         elif centring and (way is None or way.whole):
             queries = centred(model.map, queries)
-        match = model.localize_descriptors(queries, model.matching(way)._replace(copies=copies))
+        matching = model.matching(way)._replace(wrappers=run.querying.wrappers)
+        match = model.localize_descriptors(queries, matching)
         assert match.probability is not None
         probabilities[other.name] = match.probability
     return probabilities

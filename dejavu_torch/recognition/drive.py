@@ -55,8 +55,6 @@ class DriveQuery(NamedTuple):
     Attributes:
         scorer: of all queries. k: candidates. radius: suppression radius in places.
         platt: the calibration of single queries, if there is one.
-        checks: the drive only checks the answers of single queries: it lowers their probability. Where ground
-            repeats, as lane dashes do, a drive alone finds loops that are none.
         asks: single images say first whether it is a drive of the map at all.
     """
 
@@ -65,13 +63,12 @@ class DriveQuery(NamedTuple):
     k: int = 1
     radius: int = 5
     platt: Platt | None = None
-    checks: bool = False
     asks: bool = True
 
     @property
     def answers(self) -> bool:
         """Whether the drive answers, by a fitted smoother."""
-        return self.smoother.is_drive and not self.checks
+        return self.smoother.is_drive and not self.scorer.checks
 
     def fitted(self, smoother: PlaceSmoother, spacing: Spacing) -> DriveQuery:
         """The same by a fitted smoother, to which is left only what single images find as well."""

@@ -18,7 +18,7 @@ from dejavu_torch.places.layout import ROUTE, Layout
 from dejavu_torch.recognition.calibration import TOLERANCE, Platt, Track, best_pair, confidence_of
 from dejavu_torch.recognition.calibration import confidence as confidence_of_pair
 from dejavu_torch.recognition.drive import DriveQuery, answer_drives, first_of
-from dejavu_torch.recognition.scorer import BestOf, Earlier, OfMap, Scorer, of_stored
+from dejavu_torch.recognition.scorer import OfMap, Scorer, of_stored
 from dejavu_torch.recognition.search import Search, Searcher
 from dejavu_torch.recognition.select import Acceptance, accept, best_candidates, best_match
 from dejavu_torch.recognition.smoother import PlaceSmoother
@@ -47,8 +47,7 @@ class Matching(NamedTuple):
     single: Platt | None = None  # that of single queries, beside a filter's
     callback: Callable[[Tensor], None] | None = None  # receives the final scores (B,N)
     search: Search = "auto"  # of single queries, see `DejaVu.localize`
-    apart: int | None = None  # queries are the places themselves; only those over this many before answer
-    copies: int = 1  # rows of each query, evenly turned: each place has the best score of them
+    wrappers: tuple[Callable[[Scorer], Scorer], ...] = ()  # of the scores, from inside out
 
 
 SINGLE = Matching()  # each query by itself
@@ -91,9 +90,8 @@ class Localizer:
         # what single images say so far, beside mirrored ones, if these are asked
         self.running, self.total = Running(SURER[layout.dimensions]), torch.zeros(())  # sum of the queries
         filters = sequence is not None and sequence.answers == "filter"
-        self.asks: bool | None = None  # not known before the first query
-        if not filters or matching.platt is None or matching.copies > 1:
-            self.asks = False
+        # None if the first query will tell
+        self.asks = None if filters and matching.platt is not None else False
         # probabilities, each by itself, of queries that a filter has yet to answer
         self.alone = torch.empty(0, dtype=torch.float64)
         self.searcher = searcher
@@ -140,7 +138,7 @@ class Localizer:
         """Confidences in some of the queries, mirrored, (B,), NaN for the others, if a filter's answers get
         probabilities."""
         if self.asks is None:
-            self.asks = scorer.null is not None
+            self.asks = scorer.copies == 1 and scorer.null is not None
         if not self.asks:
             return None
         assert scorer.null is not None
@@ -179,7 +177,7 @@ class Localizer:
     def _turned(self, match: Match, scorer: Scorer, queries: Tensor) -> Match:
         """The match of queries with its headings, if there are copies of them, and these answer now."""
         late = self.matching.sequence is not None and self.matching.sequence.lag
-        return match if late else headed(match, scorer, queries, self.matching)
+        return match if late else headed(match, scorer, queries)
 
     def _without_blank(self, match: Match, scorer: Scorer) -> Match:
         """The match, in which blank frames find nothing by themselves."""
@@ -283,20 +281,19 @@ def judged(match: Match, matching: Matching, layout: Layout, acceptance: Accepta
     return match if matching.k is not None else match.map(lambda column: column[:, 0])
 
 
-def headed(match: Match, scorer: Scorer, queries: Tensor, matching: Matching) -> Match:
-    """The match of queries (B,) with its headings in degrees, if there are copies of them."""
-    if matching.copies == 1:
+def headed(match: Match, scorer: Scorer, queries: Tensor) -> Match:
+    """The match of queries (B,) with its headings, if there are copies of them."""
+    heading = scorer.heading_at(queries, match.index.view(len(queries), -1))
+    if heading is None:
         return match
-    index = match.index.view(len(queries), -1)
-    turn = scorer.copy_at(queries, index).cpu().view_as(match.index)
-    heading = (turn * (360 / matching.copies) - scorer.layout.north) % 360
-    return replace(match, heading=heading.float().masked_fill(match.index < 0, torch.nan))
+    return replace(match, heading=heading.view_as(match.index).masked_fill(match.index < 0, torch.nan))
 
 
 def wrapped(scorer: Scorer, matching: Matching) -> Scorer:
-    """The scores by which queries are matched, see `Matching.copies` and `apart`."""
-    scorer = BestOf(scorer, matching.copies) if matching.copies > 1 else scorer
-    return scorer if matching.apart is None else Earlier(scorer, matching.apart)
+    """The scores by which queries are matched."""
+    for wrap in matching.wrappers:
+        scorer = wrap(scorer)
+    return scorer
 
 
 @torch.no_grad()
@@ -321,15 +318,15 @@ def answer(
 
 def _of_drive(scorer: Scorer, smoother: PlaceSmoother, matching: Matching, progress: bool) -> Match:
     """Match all queries of a drive."""
-    scorer, checks = wrapped(scorer, matching), matching.apart is not None
-    asked = DriveQuery(scorer, smoother, matching.k or 1, matching.radius, matching.platt, checks)
+    scorer = wrapped(scorer, matching)
+    asked = DriveQuery(scorer, smoother, matching.k or 1, matching.radius, matching.platt)
     (answers,) = answer_drives([asked], progress)
     match, acceptance = answers.match, matching.acceptance
     # whose scores are distances
-    if acceptance.threshold is not None and not match.is_drive and not checks:
+    if acceptance.threshold is not None and not match.is_drive and not scorer.checks:
         acceptance = Acceptance(precision=math.exp(-acceptance.threshold))
     match = judged(match, matching, scorer.layout, acceptance)
-    if matching.copies == 1:
+    if scorer.copies == 1:
         return match
     parts = torch.arange(len(scorer)).split(max(1, scorer.at_once // scorer.layout.places))
-    return Match.joined(headed(match[part], scorer, part, matching) for part in parts)
+    return Match.joined(headed(match[part], scorer, part) for part in parts)

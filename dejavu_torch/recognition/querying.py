@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Literal
 
 from typing_extensions import Self
 
 from dejavu_torch.recognition.filter import PlaceFilter
+from dejavu_torch.recognition.scorer import BestOf, Earlier, Scorer
 from dejavu_torch.recognition.sequence import SequenceMatcher
 from dejavu_torch.recognition.smoother import PlaceSmoother
 from dejavu_torch.text import refuse_with
@@ -109,6 +112,12 @@ class Querying(Sequences):
         if self.centre == "mean" and together and not whole:
             raise InputError("--centre mean with a filter or a sequence; expected --match drive or single")
         return True if self.ordered or whole else False if self.unordered else None
+
+    @property
+    def wrappers(self) -> tuple[Callable[[Scorer], Scorer], ...]:
+        """Of the scores, from inside out: the best of all headings, only earlier places for loops."""
+        turned = [partial(BestOf, copies=self.headings)] if self.headings > 1 else []
+        return (*turned, *([partial(Earlier, apart=self.loops)] if self.loops is not None else []))
 
     def centres(self, default: bool) -> bool:
         """Whether single queries and those of a drive are centred."""

@@ -58,7 +58,8 @@ class Scorer(ABC):
             a drive, by at least `least` nats for each query.
         at_once: numbers that are computed together, of `most` queries. stored: the places that are stored
             themselves, (n,), if others have the scores of these. blank_finds: whether a blank query may find
-            a place by itself.
+            a place by itself. checks: whether a drive only lowers the probabilities of single queries.
+            copies: of each query, see `BestOf`.
         uncentred: of the same queries as they are, for ways that do not know all of them; None if these are.
             It belongs to the outermost: wrappers do not pass it on.
     """
@@ -72,6 +73,8 @@ class Scorer(ABC):
     most: int = sys.maxsize
     stored: Tensor | None = None
     blank_finds: bool = True
+    checks: bool = False
+    copies: int = 1
     uncentred: Scorer | None = None
 
     def __len__(self) -> int:
@@ -100,9 +103,10 @@ class Scorer(ABC):
         """How many numbers of a query are in memory, all its scores or what finds the `wanted` ones."""
         return self.layout.places
 
-    def copy_at(self, queries: Tensor, places: Tensor) -> Tensor:
-        """Which copy of each query answers at places, (B,), (B,k) -> (B,k)."""
-        return torch.zeros_like(places)
+    def heading_at(self, queries: Tensor, places: Tensor) -> Tensor | None:
+        """The headings in degrees by which queries have their scores at places, (B,), (B,k) -> (B,k); None
+        unless there are copies of them."""
+        return None
 
     def beside(self, uncentred: Scorer) -> Self:
         """Let it know the scores of its queries as they are; returns itself."""
@@ -220,6 +224,7 @@ class Wrapped(Scorer):
         self.scorer, self.layout, self.descriptors = scorer, scorer.layout, scorer.descriptors
         self.links, self.at_once, self.most = scorer.links, scorer.at_once, scorer.most
         self.stored, self.blank_finds = scorer.stored, scorer.blank_finds
+        self.checks, self.copies = scorer.checks, scorer.copies
 
     @property
     def null(self) -> Null | None:  # type: ignore[override]
@@ -242,8 +247,8 @@ class Wrapped(Scorer):
     def rows(self, queries: Tensor) -> Tensor:
         return self.changed(self.scorer.rows(self.asked(queries)), queries)
 
-    def copy_at(self, queries: Tensor, places: Tensor) -> Tensor:
-        return self.scorer.copy_at(self.asked(queries), places)
+    def heading_at(self, queries: Tensor, places: Tensor) -> Tensor | None:
+        return self.scorer.heading_at(self.asked(queries), places)
 
 
 class Reordered(Wrapped):
@@ -260,19 +265,19 @@ class Reordered(Wrapped):
     def changed(self, scores: Tensor, queries: Tensor) -> Tensor:
         return scores[:, self.place.to(scores.device)]
 
-    def copy_at(self, queries: Tensor, places: Tensor) -> Tensor:
-        return self.scorer.copy_at(queries, self.place.to(places.device)[places.clamp(min=0)])
+    def heading_at(self, queries: Tensor, places: Tensor) -> Tensor | None:
+        return self.scorer.heading_at(queries, self.place.to(places.device)[places.clamp(min=0)])
 
 
 class Earlier(Wrapped):
     """Queries are the places themselves: only those over `apart` before a query answer; blank ones find
-    nothing."""
+    nothing. Where ground repeats, as lane dashes do, a drive alone finds loops that are none."""
 
     null, least = None, 0.0
 
     def __init__(self, scorer: Scorer, apart: int) -> None:
         super().__init__(scorer)
-        self.apart = apart
+        self.apart, self.checks = apart, True
 
     def changed(self, scores: Tensor, queries: Tensor) -> Tensor:
         blank = ~self.descriptors[queries.to(self.descriptors.device)].any(1, keepdim=True)
@@ -280,13 +285,13 @@ class Earlier(Wrapped):
 
 
 class BestOf(Wrapped):
-    """Each query is so many consecutive ones of another scorer, such as its turned copies: a place has the
+    """Each query is so many consecutive ones of another scorer, its evenly turned copies: a place has the
     best score of them. What was scored last is kept until it is known which copy answers."""
 
     def __init__(self, scorer: Scorer, copies: int) -> None:
-        self.copies = copies
         super().__init__(scorer)
-        self.descriptors, self.at_once = scorer.descriptors[::copies], scorer.at_once // copies
+        self.copies, self.descriptors = copies, scorer.descriptors[::copies]
+        self.at_once = scorer.at_once // copies
         self.most = max(1, scorer.most // copies)
         self.last: tuple[Tensor, Tensor, Tensor | None] | None = None
 
@@ -312,7 +317,12 @@ class BestOf(Wrapped):
         # the best of all copies are among the best of each
         return scores.view(len(queries), -1), places.view(len(queries), -1)
 
-    def copy_at(self, queries: Tensor, places: Tensor) -> Tensor:
+    def heading_at(self, queries: Tensor, places: Tensor) -> Tensor | None:
+        turn = self._copy_at(queries, places).cpu() * (360 / self.copies)
+        return ((turn - self.layout.north) % 360).float()
+
+    def _copy_at(self, queries: Tensor, places: Tensor) -> Tensor:
+        """Which copy of each query answers at places, (B,), (B,k) -> (B,k)."""
         if self.last is None or self.last[0] is not queries:
             self.rows(queries)
         assert self.last is not None

@@ -10,7 +10,10 @@ from hypothesis import strategies as st
 from dejavu_torch import DejaVu, Layout, PlaceFilter, SpectralMapper
 from dejavu_torch.maps.distance import phase_distances
 from dejavu_torch.recognition.localizer import Matching, answer
+from dejavu_torch.recognition.querying import Querying
 from dejavu_torch.recognition.scorer import BestOf, Earlier, OfMap, OfRows, OfStored, Reordered, Wrapped
+
+TWO = Querying(headings=2).wrappers
 
 
 def noise(*shape, seed=0):
@@ -65,11 +68,12 @@ def test_wrappers_commute_where_they_have_nothing_to_do_with_each_other(copies, 
     assert one.null is other.null is None  # a shuffled map has no order to ask for
     assert torch.equal(BestOf(inner, copies).null(every, seed=2), best + 2)
     places = one.rows(every).topk(2, 1, largest=False).indices
-    turn = BestOf(inner, copies).copy_at(every, order.argsort()[places])
+    turn = BestOf(inner, copies).heading_at(every, order.argsort()[places])
     at = scores.view(6, copies, 9).gather(2, order.argsort()[places][:, None].expand(-1, copies, -1))
-    assert torch.equal(turn, at.argmin(1))
-    assert torch.equal(one.copy_at(every, places), turn)
-    assert torch.equal(other.copy_at(every, places), turn)
+    assert torch.equal(turn, at.argmin(1) * (360 / copies))
+    assert torch.equal(one.heading_at(every, places), turn)
+    assert torch.equal(other.heading_at(every, places), turn)
+    assert Reordered(inner, order).heading_at(every, places) is None
     assert torch.equal(one.descriptors, inner.descriptors[::copies])
 
 
@@ -82,7 +86,8 @@ def test_frames_that_are_stored_keep_their_numbers_in_another_order():
 
 
 @pytest.mark.parametrize(
-    "matching", [Matching(), Matching(PlaceFilter(lag=3)), Matching(copies=2, k=3), Matching(copies=2)]
+    "matching",
+    [Matching(), Matching(PlaceFilter(lag=3)), Matching(k=3, wrappers=TWO), Matching(wrappers=TWO)],
 )
 def test_a_wrapper_that_changes_nothing_changes_no_answer(place_map, matching):
     model = DejaVu(None, "none")
