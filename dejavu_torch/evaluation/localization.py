@@ -31,9 +31,9 @@ class Localization(NamedTuple):
     truth: None if unknown. tolerance: in places, inclusive. matching: for the map and all baselines.
     querying: as asked for. causal_features: the queries for sequences and filters, if query_features are
     centred, which takes all of them. match: the answers. judged: the matches that the scores at top level
-    judge, with those of other models. beside: a smoother to compare all contenders by, if any. radius: over an area, the distance
-    within which a match is right, in the unit of its coordinates; tolerance is 0. Along a route the tolerance
-    once more.
+    judge, with those of other models. beside: a smoother to compare all contenders by, if any. radius: over
+    an area, the distance within which a match is right, in the unit of its coordinates; tolerance is 0. Along
+    a route the tolerance once more.
 
     Convention 11: match and truth count places and queries, pictures show frames of the sources.
     """
