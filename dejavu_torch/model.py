@@ -9,7 +9,7 @@ import math
 from collections.abc import Callable, Iterator
 from dataclasses import fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 from torch import Tensor, nn
 from torch.nn.parameter import is_lazy
@@ -52,6 +52,7 @@ log = logging.getLogger("dejavu_torch")
 MANY_FEATURES = 50_000  # per frame: more are warned of
 DESCRIBES = ("preprocess", "features", "whitening", "batch_size", "weight_bits")  # of the descriptor
 REMOVED = 0.5  # of each place's mean score where lengths count: without it only inner products would remain
+Way = TypeVar("Way", bound=SequenceModel)
 STATE = [field.name for field in fields(model_file.ModelState)]
 
 
@@ -574,10 +575,13 @@ class DejaVu(nn.Module):
             only = "calibrated for single queries and for a filter only"
             seen = f"the precision is {self.precision}, but the map is "
             raise InputError(f"{seen}{only if self.calibration else 'not calibrated'}; expected a threshold")
-        if sequence is not None and self.descriptor.keeps_lengths:
-            sequence = sequence.having(removed=REMOVED)
+        sequence = sequence and self.adapted(sequence)
         accepts, single = self.acceptance(sequence), self.calibration and self.calibration.single
         return Matching(sequence, acceptance=accepts, platt=platt, single=single, search=search or "auto")
+
+    def adapted(self, way: Way) -> Way:
+        """A way of matching as the scores of these descriptors need it."""
+        return way.having(removed=REMOVED) if self.descriptor.keeps_lengths else way
 
     def acceptance(self, sequence: SequenceModel | None = None) -> Acceptance:
         """Which answers are accepted, for single queries or for a sequence (convention 4).

@@ -29,7 +29,7 @@ FRAME_NUMBERS = 2**28  # values in one frame: 1 GB
 
 Facts: TypeAlias = dict[str, Any]  # what JSON holds, settings and other values of many types, by name
 # T queries in a sequence, all so far in a filter, or all of the drive in a smoother
-Together = int | Literal["filter", "smoother"]
+Together = int | Literal["filter", "smoother", "sequence"]
 
 
 def check_shape(x: Tensor, dims: str, name: str) -> None:
@@ -386,7 +386,7 @@ class SequenceModel(nn.Module, ABC):
     @property
     def key(self) -> Together:
         """By which its matches are among `Match.sequences`."""
-        return "filter"
+        return "filter" if self.answers == "filter" else "sequence"
 
     def over(self, layout: Layout) -> Self:
         """The same for places that lie so; InputError if it makes no sense there."""

@@ -28,7 +28,7 @@ from dejavu_torch.model_file import recipe_of
 from dejavu_torch.motion.resampling import ResampledTraverse
 from dejavu_torch.places.layout import ROUTE, Layout
 from dejavu_torch.recognition.drive import DriveQuery, localize_drives
-from dejavu_torch.recognition.localizer import SINGLE, Matching, answer
+from dejavu_torch.recognition.localizer import SINGLE, Matching, answer, wrapped
 from dejavu_torch.recognition.scorer import OfMap, OfStored, Reordered, Scorer
 from dejavu_torch.recognition.smoother import PlaceSmoother
 from dejavu_torch.types import InputError, Match, Traverse
@@ -82,7 +82,7 @@ def matched(
     for key, one in baselines:
         found[key] = one._replace(scorer=None), one.match(matching, progress)
         if one.scorer is not None and smoother is not None and (driven is None or key in driven):
-            asked[key] = DriveQuery(one.scorer, smoother, radius=0, asks=False)
+            asked[key] = DriveQuery(wrapped(one.scorer, matching), smoother, radius=0, asks=False)
         del one  # its descriptors, before those of the next
     for key, drive in zip(asked, localize_drives([*asked.values()], progress), strict=True):
         (one, match), best = found[key], drive.map(lambda column: column[:, 0])

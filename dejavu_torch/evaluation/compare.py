@@ -55,6 +55,7 @@ from dejavu_torch.places.layout import Reach
 from dejavu_torch.recognition.centring import centred
 from dejavu_torch.recognition.localizer import Matching, answer
 from dejavu_torch.recognition.querying import QUERYING, Querying
+from dejavu_torch.recognition.scorer import Scorer
 from dejavu_torch.recognition.select import check_candidates
 from dejavu_torch.recognition.smoother import PlaceSmoother
 from dejavu_torch.types import Facts, InputError, Match, SequenceModel, Traverse, expect
@@ -178,11 +179,11 @@ def compare(
     with model.descriptor.setting_aside(*([] if plan.known is None else [plan.reference, plan.query])):
         run = _learned(plan)
         with plan.learning.calibrated(model, plan.reference, plan.within(run.truth), reporting.progress):
-            run, candidates = _answered(plan, run)
+            run, ranked, candidates = _answered(plan, run)
             way = plan.way and plan.way.having(within=plan.within(run.truth))
             off_map = found_elsewhere(run, plan.off, way, plan.centring, reporting.progress)
         model.cpu()
-        found = _told(plan, run, candidates, off_map)
+        found = _told(plan, run, ranked, off_map)._replace(candidates=candidates)
         if reporting.on_found is not None:
             reporting.on_found(found)
         contenders = _contenders(plan, found.run)
@@ -317,43 +318,48 @@ def _learned(plan: Plan) -> Localization:
     return run._replace(querying=plan.querying, radius=plan.reach.radius)
 
 
-def _answered(plan: Plan, run: Localization) -> tuple[Localization, Match]:
-    """The run with its answers, and the best places of each query, as far as recall@N or `top` needs."""
+def _answered(plan: Plan, run: Localization) -> tuple[Localization, Match, Match]:
+    """The run with its answers, and the best places of each query, as far as recall@N needs, and, for its
+    answer, as far as `top` needs."""
     model, querying, progress = plan.model, plan.querying, plan.reporting.progress
     matching, whole, beside = plan.ways(run)
-    run = run._replace(matching=matching, beside=beside)
-    way, loops, places = run.sequence, querying.loops, model.map.places
-    ranks = max(querying.top or 1, min(max(RANKS), places))
+    ranks = max(querying.top or 1, min(max(RANKS), model.map.places))
+
+    def found(scorer: Scorer, own: Matching) -> Match:
+        own = own._replace(k=ranks, radius=run.tolerance, wrappers=querying.wrappers)
+        return answer(scorer, own, progress)
+
     with timed(plan.seconds, "localize"):
         if run.query is not run.reference:
             run = run._replace(query_features=run.described_by(model, progress))
-        queries = run.query_features
+        queries, way = run.query_features, matching.sequence
         if plan.centring and not isinstance(run.asked, Turned):
             run = run._replace(query_features=centred(model.map, queries), causal_features=queries)
         if way is not None:
-            way.check(len(run.query), places)
-        # whose acceptance is not asked for beside a drive
-        own = Matching(way, platt=model.calibration and model.calibration.of(way))
-        own = own if whole else model.matching(way)
-        own = own._replace(also=matching.also, k=ranks, radius=run.tolerance, wrappers=querying.wrappers)
-        scorer = run.scorer_by(partial(model.scorer, matching=own))
-        found = answer(scorer, own, progress)
-        best = found.map(lambda column: column[:, 0])
-        run = run._replace(match=best, judged=best)
-        if (smoother := whole or beside) is not None:
-            own = model.matching(smoother) if loops is None else model.loop_matching(loops, smoother)
-            own = own._replace(k=ranks, radius=run.tolerance, wrappers=querying.wrappers)
-            drive = answer(scorer, own, progress)
-            best, removed = drive.map(lambda column: column[:, 0]), getattr(own.sequence, "removed", 1.0)
-            if loops is None:
-                judged = replace(run.judged, sequences={**run.judged.sequences, "smoother": best})
-                run = run._replace(judged=judged, beside=beside and beside.having(removed=removed))
-            if whole is not None:
-                run, found = run._replace(match=best), drive
-    return run, found
+            way.check(len(run.query), model.map.places)
+        # beside a drive nobody asks which single images are accepted
+        single = (
+            model.matching(way)
+            if whole is None
+            else Matching(platt=model.calibration and model.calibration.single)
+        )
+        scorer = run.scorer_by(partial(model.scorer, matching=single))
+        match = found(scorer, single._replace(also=matching.also))
+        best = match.map(lambda column: column[:, 0])
+        run = run._replace(matching=matching, beside=beside, match=best, judged=best)
+        if (smoother := whole or beside) is None:
+            return run, match, match
+        loops = querying.loops
+        own = model.matching(smoother) if loops is None else model.loop_matching(loops, smoother)
+        drive = found(scorer, own)
+        best = drive.map(lambda column: column[:, 0])
+        if loops is None:
+            judged = replace(run.judged, sequences={**run.judged.sequences, "smoother": best})
+            run = run._replace(judged=judged, beside=beside and model.adapted(beside))
+    return (run, match, match) if whole is None else (run._replace(match=best), match, drive)
 
 
-def _told(plan: Plan, run: Localization, candidates: Match, off_map: dict[str, Tensor]) -> Comparison:
+def _told(plan: Plan, run: Localization, ranked: Match, off_map: dict[str, Tensor]) -> Comparison:
     """The map's own answers, before they are compared with anything."""
     model, truth, interpolate = plan.model, plan.truth, plan.reporting.interpolate
     run = run._replace(
@@ -363,14 +369,14 @@ def _told(plan: Plan, run: Localization, candidates: Match, off_map: dict[str, T
     headings, views = plan.querying.headings, plan.learning.views
     facts: Facts = {
         **facts_of(run, plan.seconds),
-        **match_facts(run, candidates, truth, interpolate, off_map),
+        **match_facts(run, ranked, truth, interpolate, off_map),
         "centred": plan.centring,
         **({"headings": headings} if headings > 1 else {}),
         **metric_facts(run, truth),
         **({"second": views.placed_facts()} if views is not None and views.placed else {}),
     }
     pictures = draw_pictures(run, {"map": ours}) | draw_reliability(run.scored, run.truth, run.tolerance)
-    return Comparison(Report(ours, {}, facts), pictures, run, candidates)
+    return Comparison(Report(ours, {}, facts), pictures, run, ranked)
 
 
 def _contenders(plan: Plan, run: Localization) -> dict[str, Contender]:

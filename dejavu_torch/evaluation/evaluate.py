@@ -31,6 +31,7 @@ from dejavu_torch.evaluation.answers import answer_facts, shift_facts
 from dejavu_torch.evaluation.contenders import contend
 from dejavu_torch.evaluation.match_plots import draw_coverage
 from dejavu_torch.evaluation.matches import ELSEWHERE, read_matches
+from dejavu_torch.evaluation.options import REACH
 from dejavu_torch.evaluation.plots import Pictures
 from dejavu_torch.evaluation.rejection import draw_reliability, reach_of, rejection_facts
 from dejavu_torch.evaluation.report import Report
@@ -161,8 +162,7 @@ def evaluate_file(
     match = replace(match, index=candidates[:, 0])
     reach = reach_of(tolerance, known, near is not None)
     if match.probability is not None and reach != TOLERANCE:
-        line = "probabilities of `localize` are of being within %d places; here right is within %d"
-        log.warning(line, TOLERANCE, reach)
+        log.warning(f"`localize` writes {REACH}", TOLERANCE, reach)
     described = describe_ground_truth(truth, interpolate, carried)
     facts = evaluation_facts(match, candidates, known, tolerance, positions, described) | alone
     if near is not None and layout.units:

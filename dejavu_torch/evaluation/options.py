@@ -28,6 +28,7 @@ from dejavu_torch.types import InputError, Traverse, expect
 log = logging.getLogger("dejavu_torch")
 
 NO_CALIBRATION = "none"
+REACH = "probabilities of being within %d places; here one is right within %d"
 UNREAD = (None, NO_CALIBRATION)  # values of --calibration that name no source
 PYTHON = {"option": False}  # metadata of a field that is no option of a command
 
@@ -75,10 +76,10 @@ class Learning:
     ) -> tuple[Reference, Self]:
         """The reference, if there is one, and the same with frames in place of sources; all are opened and
         compared before one of them is measured."""
-        seconds = [one for one in several(self.second) if not isinstance(one, LabelledFrames)]
+        seconds = [] if self.views is not None else several(self.second)
         named = self.calibration if isinstance(self.calibration, str) else None
         named = None if named == NO_CALIBRATION else named
-        if not seconds:
+        if self.second is None:
             check_no_truth("second", self.second_truth)
         if named is None:
             check_no_truth("calibration", self.calibration_truth)
@@ -89,9 +90,10 @@ class Learning:
             visits.append(open_another("second", source, [*others, *visits]))
         other = None if named is None else open_another("calibration", named, [*others, *visits])
         opened = replace(self, second_truth=None, calibration_truth=None)
-        if reference is not None and (visits or other is not None):
+        placed = self.second is not None and self.views is None
+        if reference is not None and (placed or other is not None):
             reference = model.resample(reference, model.step, True, model.frame_shape)
-            if visits:
+            if placed:
                 truths = [None if truth is None else str(truth) for truth in several(self.second_truth)]
                 views = growth.second_traverse(model, reference, visits, truths or None, True)
                 opened = replace(opened, second=views)
@@ -115,8 +117,7 @@ class Learning:
                     growth.calibrate_if_possible(model, reference, visit, progress=progress, reach=reach)
                 if model.calibration is None:
                     model.calibration = held
-                    line = "the map tells probabilities of being within %d places; right is within %d"
-                    log.warning(line, TOLERANCE, reach)
+                    log.warning(f"the map gives {REACH}", TOLERANCE, reach)
             yield
         finally:
             model.calibration = held

@@ -698,8 +698,8 @@ MUTANTS = [
     Mutant(
         "Where lengths count, half of each place's mean score stays.",
         "dejavu_torch/model.py",
-        "sequence = sequence.having(removed=REMOVED)",
-        "pass",
+        "return way.having(removed=REMOVED) if self.descriptor.keeps_lengths else way",
+        "return way",
         ("tests/features/test_whitening.py::-k told_by_the_file",),
     ),
     Mutant(
