@@ -12,6 +12,7 @@ from dejavu_torch.evaluation.compare import compare
 from dejavu_torch.evaluation.options import Reporting
 from dejavu_torch.evaluation.storage import coded_at_sizes, noise_over_map
 from dejavu_torch.maps.spectral import SpectralMapper
+from dejavu_torch.places.layout import Layout
 from dejavu_torch.recognition.querying import Querying
 
 PLACES, NUMBERS = 400, 16
@@ -119,3 +120,13 @@ def test_what_has_no_storage_curve_is_refused():
         compare(*pair, reporting=Reporting(storage_curve=True))
     with refused("a storage curve of templates", "SpectralMapper"):
         compare(*pair, "0", model=template_model(), reporting=Reporting(storage_curve=True))
+
+
+def test_noise_as_smooth_as_an_area_takes_as_many_bytes_as_noise_does():
+    """Of smooth noise in rows and columns no repetition can be saved; read row by row it would be rougher."""
+    draw = torch.Generator().manual_seed(0)
+    plane = torch.nn.functional.avg_pool2d(torch.randn(12, 36, 44, generator=draw), 5, 1)
+    layout, places = Layout(32, 40), plane.flatten(1).T
+    place_map = SpectralMapper(6.0)(places, layout)
+    assert len(place_map.chunks) == 1
+    assert noise_over_map(place_map, places) == pytest.approx(1, abs=0.1)
