@@ -88,12 +88,12 @@ class Querying(Sequences):
         ordered: queries are in order, as in a video; needed for a .npy of frames
         unordered: queries are in no order: match each by itself
         centre: mean removes what all queries share but the map does not; default for 50 or more in order
-        top: find this many places per query, no two within the tolerance (`dejavu localize`: 5) of each
-            other, each in a row with its rank; only the first has a probability
+        top: places per query, no two within the tolerance (localize: 5), each in a row with its rank; only
+            the first has a probability
         loops: find where a drive returns to its own places, on a map learned from it; ignore this many frames
             before each frame, and all after it
-        headings: on the map of an area, try this many headings of each image, evenly over 360 degrees, such
-            as 24, which takes 24 times as long
+        headings: tried per image on the map of an area, evenly over 360 degrees, such as 24, which takes 24
+            times as long
     """
 
     ordered: bool = False
