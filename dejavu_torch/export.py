@@ -249,7 +249,7 @@ def _facts(model: DejaVu, sequence: SequenceModel | None, centre: bool) -> Facts
         state = list(sequence.start(places, fixed=True).shape)
         facts["inputs"] = {name: [1, *sizes], "state": state}
         facts["outputs"] = {"scores": [1, places], "next_state": state}
-        facts["first_state"] = "nan" if sequence.answers == "sequence" else "0"
+        facts["first_state"] = "nan" if sequence.start(places, fixed=True).isnan().any() else "0"
         facts["sequence"] = str(sequence)
         threshold = sequence.threshold_of(model.threshold)
         threshold = sequence.likely if threshold is None else threshold  # without a calibration

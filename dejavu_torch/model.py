@@ -496,14 +496,21 @@ class DejaVu(nn.Module):
         search: Search | None = None,
         apart: int = 5,
     ) -> Iterator[Match]:
-        """As `localize`, or with `top` as `candidates`, one batch of queries at a time, in constant memory;
-        with a smoother, centred queries or several headings, after the descriptors of all queries."""
+        """As `localize`, with `top` as `candidates`, or as `loops`: one batch of queries at a time, in constant
+        memory, or after the descriptors of all with a smoother, centred queries or several headings."""
         require_map(self)
         if querying.top is not None:
             check_candidates(querying.top, apart, self.map.places)
-        queries = self.at_map_size(as_traverse(queries), self.frame_shape or ())
-        sequence, headings = querying.matcher(ordered=queries.ordered), querying.headings
+        querying.check_loops()
+        sequence, headings, queries = querying.matcher(), querying.headings, as_traverse(queries)
+        ordered = querying.order(sequence)
+        if sequence == "auto":
+            sequence = querying.matcher(ordered=queries.ordered if ordered is None else ordered)
         assert not isinstance(sequence, str)
+        if querying.loops is not None:
+            yield self.loops(queries, querying.loops, sequence is not None and sequence.whole, progress)
+            return
+        queries = self.at_map_size(queries, self.frame_shape or ())
         matching = self.matching(sequence, search)
         matching = matching._replace(k=querying.top, radius=apart, wrappers=querying.wrappers)
         localizer = self.localizer(matching)
@@ -581,7 +588,7 @@ class DejaVu(nn.Module):
 
     def adapted(self, way: Way) -> Way:
         """A way of matching as the scores of these descriptors need it."""
-        return way.having(removed=REMOVED) if self.descriptor.keeps_lengths else way
+        return way.having(removed=REMOVED if self.descriptor.keeps_lengths else 1.0)
 
     def acceptance(self, sequence: SequenceModel | None = None) -> Acceptance:
         """Which answers are accepted, for single queries or for a sequence (convention 4).

@@ -60,3 +60,12 @@ def test_options_that_do_nothing_for_ready_features_are_told(tmp_path, caplog):
     assert "ready features" not in caplog.text
     run("learn", *arguments, "--preprocess.channel", "R-B")
     assert "these are ready features: channel and contrast have no effect" in caplog.text
+
+
+def test_a_longer_drive_than_the_map_has_places_is_evaluated(tmp_path):
+    route, drive = "sim:aerial?frames=60&size=32", "sim:aerial?frames=90&size=32&traverse=1"
+    run("learn", route, "--map", tmp_path / "m.safetensors")
+    run("localize", tmp_path / "m.safetensors", drive, "--out", tmp_path / "m.csv")
+    words = ("--truth", "0", "--map", tmp_path / "m.safetensors", "--out", tmp_path / "e")
+    run("evaluate", tmp_path / "m.csv", *words)
+    assert report_of(tmp_path / "e")["queries"] == 90

@@ -126,15 +126,15 @@ def run_localize(
 
 def _found(model: DejaVu, query: Traverse, querying: Querying) -> tuple[Iterator[Match], Acceptance]:
     """The matches of a query, of which candidates follow each other, and how they are accepted."""
-    matcher, top = querying.matcher(), querying.top
+    matcher, loops, top = querying.matcher(), querying.loops, querying.top
     assert not isinstance(matcher, str)
     smooths, acceptance = matcher is not None and matcher.whole, model.matching(matcher).acceptance
-    if querying.loops is not None:
-        acceptance = model.loop_matching(querying.loops, PlaceSmoother() if smooths else None).acceptance
-        return iter([model.loops(query, querying.loops, smooths, True)]), acceptance
-    centre = smooths or matcher is None
-    centre &= querying.centres(querying.ordered and model.centres(len(query)))
-    querying = replace(querying, centre="mean" if centre else "none")
+    if loops is not None:
+        acceptance = model.loop_matching(loops, PlaceSmoother() if smooths else None).acceptance
+    else:
+        centre = smooths or matcher is None
+        centre &= querying.centres(querying.ordered and model.centres(len(query)))
+        querying = replace(querying, centre="mean" if centre else "none")
     matches = model.matches(query, querying, True, apart=SUPPRESSION)
     return matches if top is None else (part.map(Tensor.flatten) for part in matches), acceptance
 

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import argparse
 import inspect
+import operator
 import os
 import re
 import sys
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import fields, is_dataclass
-from functools import cache
+from functools import cache, reduce
 from pathlib import Path
-from typing import Any, NoReturn, Union, cast, get_args, get_origin, get_type_hints
+from typing import Any, NoReturn, cast, get_args, get_origin, get_type_hints
 
 import docstring_parser
 import jsonargparse
@@ -237,7 +238,7 @@ def fields_of(options: type) -> Iterator[inspect.Parameter]:
         kind, kinds = types[one.name], get_args(types[one.name])
         if str in kinds:
             known = [part for part in kinds if part in (str, type(None)) or get_origin(part) is list]
-            kind = Union[tuple(known)]  # noqa: UP007
+            kind = reduce(operator.or_, known)
         if one.name not in hidden:
             yield one.replace(annotation=kind)
 

@@ -213,8 +213,9 @@ def _planned(
     """Open what is compared, at even steps, and refuse what does not fit, before anything is learned."""
     expect(tolerance >= 0, "at least 0", f"tolerance is {tolerance}")
     parsed = None if truth is None else check_ground_truth(truth, reporting.interpolate)
-    check_candidates(querying.top or 1, tolerance)
+    check_candidates(querying.ranks, tolerance)
     reporting.check(model, querying)
+    learning.seed_whitening(model)
     itself, headings = querying.loops is not None, querying.headings
     expect(query is not None or itself, "a second visit, or loops within the reference", "there is no query")
     expect(query is None or not itself, "the reference alone", f"--loops {querying.loops} and a query")
@@ -225,9 +226,9 @@ def _planned(
     has_map = model.map.places > 0
     first, same = as_traverse(reference), query is reference
     second = first if same else None if query is None else as_traverse(query)
-    first, learning = learning.opened(model, first, second)
+    first, learning = learning.opened(model, first, second, reporting.progress)
     reference, query, off = _prepared(model, first, first if same else second, querying, reporting, seconds)
-    check_candidates(querying.top or 1, tolerance, len(reference))
+    check_candidates(querying.ranks, tolerance, len(reference))
     layout = reference.layout
     north = facing_north(query, layout, headings)  # pictures show images, not their copies
     query = north if headings == 1 else query
@@ -250,7 +251,7 @@ def _planned(
     reporting.check_contenders(COLOURS, known is not None, len(query) * headings, len(reference))
     if known is not None and near is None and reach.within > reach.tolerance:
         known = widened(known, layout, reach.within)
-    told = truth, known, near is not None, reach, way, in_order, ordered is not None
+    told = truth, known, near is not None, reach, way, in_order, querying.ordered or querying.unordered
     return Plan(model, has_map, reference, query, off, *told, learning, querying, reporting, seconds)
 
 
@@ -323,7 +324,7 @@ def _answered(plan: Plan, run: Localization) -> tuple[Localization, Match, Match
     answer, as far as `top` needs."""
     model, querying, progress = plan.model, plan.querying, plan.reporting.progress
     matching, whole, beside = plan.ways(run)
-    ranks = max(querying.top or 1, min(max(RANKS), model.map.places))
+    ranks = max(querying.ranks, min(max(RANKS), model.map.places))
 
     def found(scorer: Scorer, own: Matching) -> Match:
         own = own._replace(k=ranks, radius=run.tolerance, wrappers=querying.wrappers)
@@ -395,7 +396,7 @@ def _contenders(plan: Plan, run: Localization) -> dict[str, Contender]:
             scorer, size = other.scorer(run.described_by(other, progress), run.matching), other.summary()
             match = answer(scorer, run.matching, progress)
             if run.beside is not None and reporting.drives == "all":
-                drive = answer(scorer, other.matching(run.beside), progress)
+                drive = answer(scorer, Matching(other.adapted(run.beside)), progress)
                 match = replace(match, sequences={**match.sequences, "smoother": drive})
             yield key, Baseline(name, None, size.map_bytes, None, size.fixed_bytes, match)
 

@@ -150,11 +150,11 @@ def evaluate_file(
         raise InputError("there is no ground truth; expected one, or sources with coordinates")
     carried = all(traverse is not None and traverse.places is not None for traverse in (reference, query))
     alone = answer_facts(match, queries, tolerance, True, offset_of(truth, carried))
-    elsewhere, numbers = candidates == ELSEWHERE, queries
+    elsewhere = candidates == ELSEWHERE
     if place_map is not None:
         known, candidates = ground_truth_in_places(known, place_map.place_of), place_map.place_of(candidates)
-        numbers = place_map.place_of(queries)
-    known = known if loops is None else of_loops(known, numbers, loops)
+    if loops is not None:
+        known = of_loops(known, queries if place_map is None else place_map.place_of(queries), loops)
     here = replace(match, index=candidates[:, 0].masked_fill(elsewhere[:, 0], -1))
     if route is not None:  # number places on other routes beyond every place of this one and its truth
         highest = max(int(table.max()) for table in (candidates, known.positives) if table.numel())

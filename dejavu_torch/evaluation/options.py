@@ -12,7 +12,8 @@ from typing import Any, Literal, TypeVar
 from typing_extensions import Self
 
 from dejavu_torch import growth
-from dejavu_torch.data.source import open_source
+from dejavu_torch.data.arrays import UNNAMED
+from dejavu_torch.data.source import as_traverse
 from dejavu_torch.data.traverse import parts_of
 from dejavu_torch.features.views import LabelledFrames
 from dejavu_torch.maps.spectral import SpectralMapper
@@ -51,7 +52,7 @@ class Learning:
     """
 
     seed: int = 0
-    second: list[str] | str | LabelledFrames | None = None
+    second: list[str] | str | Traverse | LabelledFrames | None = None
     second_truth: list[str | int | None] | str | None = None
     calibration: str | LabelledFrames | Traverse | None = None
     calibration_truth: str | None = None
@@ -72,13 +73,14 @@ class Learning:
             model.whitening.seed = model.whitening.seed or self.seed
 
     def opened(
-        self, model: DejaVu, reference: Reference, query: Traverse | None = None
+        self, model: DejaVu, reference: Reference, query: Traverse | None = None, progress: bool = True
     ) -> tuple[Reference, Self]:
         """The reference, if there is one, and the same with frames in place of sources; all are opened and
         compared before one of them is measured."""
         seconds = [] if self.views is not None else several(self.second)
-        named = self.calibration if isinstance(self.calibration, str) else None
-        named = None if named == NO_CALIBRATION else named
+        named = None if isinstance(self.calibration, LabelledFrames) else self.calibration
+        if named == NO_CALIBRATION or (isinstance(named, Traverse) and self.calibration_truth is None):
+            named = None
         if self.second is None:
             check_no_truth("second", self.second_truth)
         if named is None:
@@ -92,10 +94,10 @@ class Learning:
         opened = replace(self, second_truth=None, calibration_truth=None)
         placed = self.second is not None and self.views is None
         if reference is not None and (placed or other is not None):
-            reference = model.resample(reference, model.step, True, model.frame_shape)
+            reference = model.resample(reference, model.step, progress, model.frame_shape)
             if placed:
                 truths = [None if truth is None else str(truth) for truth in several(self.second_truth)]
-                views = growth.second_traverse(model, reference, visits, truths or None, True)
+                views = growth.second_traverse(model, reference, visits, truths or None, progress)
                 opened = replace(opened, second=views)
             if other is not None:
                 other = model.at_map_size(other, reference.frame_shape)
@@ -218,10 +220,13 @@ def several(given: object) -> list[Any]:
     return [] if given is None else [*given] if listed else [given]  # type: ignore[misc]
 
 
-def open_another(option: str, source: str, others: Iterable[Traverse | None]) -> Traverse:
+def open_another(option: str, source: str | Traverse, others: Iterable[Traverse | None]) -> Traverse:
     """Open the traverse of an option; refuse one of the others, however its path is written."""
-    traverse = open_source(source)
-    for other in others:
-        if other is not None and Path(other.name).resolve() == Path(traverse.name).resolve():
-            raise InputError(f"--{option} {source} is {other.name} itself; expected another visit")
+    traverse = as_traverse(source)
+    path = Path(traverse.name).resolve()
+    for other in (one for one in others if one is not None):
+        named = traverse.name != UNNAMED
+        if other is traverse or (named and Path(other.name).resolve() == path):
+            given = source if isinstance(source, str) else source.name
+            raise InputError(f"--{option} {given} is {other.name} itself; expected another visit")
     return traverse

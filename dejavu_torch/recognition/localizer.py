@@ -57,7 +57,7 @@ class Localizer:
     """Consecutive queries -> matches; keeps the state of a sequence or a filter between batches.
 
     Args:
-        route: the map; None if only `match` is used, with scores from elsewhere.
+        place_map: None if only `next` and `match` are used, with scores from elsewhere.
         searcher: finds the best places of single queries; None is a `Scan`.
         layout: of the places, without a map.
 
@@ -141,15 +141,15 @@ class Localizer:
             self.asks = scorer.copies == 1 and scorer.null is not None
         if not self.asks:
             return None
-        assert scorer.null is not None
         descriptors = scorer.descriptors[queries.to(scorer.descriptors.device)]
         numbers = torch.arange(len(descriptors)) + self.running.queries
         sums = self.total.to(descriptors) + descriptors.nan_to_num(0).cumsum(0)
-        found = descriptors.new_full((len(descriptors),), math.nan)
+        found = torch.full((len(descriptors),), math.nan)
         some = (numbers < AT_FIRST) | (numbers % EVERY == 0)
         if bool(some.any()):
             so_far = sums[some], 1 + numbers.to(sums)[some, None]
-            found[some] = confidence_of(scorer.null(queries[some], so_far=so_far), self.layout)
+            scores = scorer.mirrored(queries[some], so_far=so_far)
+            found[some] = confidence_of(scores, self.layout).cpu().to(found)
         self.total = sums[-1]
         return found
 
@@ -161,7 +161,7 @@ class Localizer:
             stored: the only places that single images find, (n,). mirrored: see `_mirrored`.
         """
         if mirrored is not None:
-            odds = self.running(confidence_of(scores, self.layout), mirrored)
+            odds = self.running(confidence_of(scores, self.layout).cpu(), mirrored)
             platt = self.matching.single or Platt(0.0, math.inf)
             alone = platt.probability(confidence_of(scores, self.layout, platt.margin))
             self.alone = torch.cat([self.alone, alone])
@@ -283,7 +283,7 @@ def judged(match: Match, matching: Matching, layout: Layout, acceptance: Accepta
 
 def headed(match: Match, scorer: Scorer, queries: Tensor) -> Match:
     """The match of queries (B,) with its headings, if there are copies of them."""
-    heading = scorer.heading_at(queries, match.index.view(len(queries), -1))
+    heading = scorer.heading_at(queries, match.index.view(len(queries), -1 if len(queries) else 1))
     if heading is None:
         return match
     return replace(match, heading=heading.view_as(match.index).masked_fill(match.index < 0, torch.nan))

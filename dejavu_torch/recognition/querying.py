@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Literal
@@ -61,11 +62,12 @@ class Sequences:
             return self.match
         way, length = self.way, None
         if way is not None and way.startswith("sequence:"):
-            length = way.removeprefix("sequence:")
-            expect(length.isdecimal() and len(length) < 10, WAYS, f"--match {way}")
+            with suppress(ValueError):
+                length = float(way.removeprefix("sequence:"))
+            expect(length is not None and length % 1 == 0, WAYS, f"--match {way}")
         elif way not in (None, "drive", "filter", "single"):
             raise InputError(f"--match {way}; expected {WAYS}")
-        fits = self.speeds is None or length not in (None, "1")
+        fits = self.speeds is None or length not in (None, 1)
         expect(fits, "--match sequence:T with them", f"--speeds {self.speeds} without a sequence")
         if length is not None:
             matcher = SequenceMatcher(int(length), (1.0,) if self.speeds is None else self.speeds)
@@ -112,6 +114,11 @@ class Querying(Sequences):
         if self.centre == "mean" and together and not whole:
             raise InputError("--centre mean with a filter or a sequence; expected --match drive or single")
         return True if self.ordered or whole else False if self.unordered else None
+
+    @property
+    def ranks(self) -> int:
+        """Places per query."""
+        return 1 if self.top is None else self.top
 
     @property
     def wrappers(self) -> tuple[Callable[[Scorer], Scorer], ...]:

@@ -36,16 +36,14 @@ Wanted = Sequence[NmsSpec]
 Lowest = tuple[Tensor, Tensor | None]  # scores (B,n) and their places; None are all places in order
 
 
+# sums (B,K) and counts (B,1) of the queries that each is mirrored about
+SoFar = tuple[Tensor, Tensor]
+
+
 class Null(Protocol):
-    """As `Rows`, of queries that are `flipped`, for a seed.
+    """As `Rows`, of queries that are `flipped`, for a seed, about those so far, or about all."""
 
-    Args:
-        so_far: sums (B,K) and counts (B,1) of the queries that each is mirrored about; None is all of them.
-    """
-
-    def __call__(
-        self, queries: Tensor, seed: int = 0, so_far: tuple[Tensor, Tensor] | None = None
-    ) -> Tensor: ...
+    def __call__(self, queries: Tensor, seed: int = 0, so_far: SoFar | None = None) -> Tensor: ...
 
 
 class Scorer(ABC):
@@ -113,6 +111,11 @@ class Scorer(ABC):
         self.uncentred = uncentred
         return self
 
+    def mirrored(self, queries: Tensor, seed: int = 0, so_far: SoFar | None = None) -> Tensor:
+        """What `null` gives, if that is not None."""
+        assert self.null is not None
+        return self.null(queries, seed=seed) if so_far is None else self.null(queries, seed, so_far)
+
     def parts(self, wanted: Wanted = ()) -> list[Tensor]:
         """The numbers of all queries, as many as are scored, or searched for `wanted` ones, together."""
         size = max(1, min(self.most, self.at_once // max(1, self.held(wanted))))
@@ -137,7 +140,7 @@ class OfMap(Scorer):
 
     @property
     def null(self) -> Null | None:  # type: ignore[override]
-        return self._mirrored if self.fidelity is not None and self.fidelity >= FAITHFUL else None
+        return self.mirrored if self.fidelity is not None and self.fidelity >= FAITHFUL else None
 
     @property
     def least(self) -> float:  # type: ignore[override]
@@ -172,9 +175,7 @@ class OfMap(Scorer):
     def _asked(self, queries: Tensor) -> Tensor:
         return self.descriptors[queries.to(self.descriptors.device)].to(self.place_map.device)
 
-    def _mirrored(
-        self, queries: Tensor, seed: int = 0, so_far: tuple[Tensor, Tensor] | None = None
-    ) -> Tensor:
+    def mirrored(self, queries: Tensor, seed: int = 0, so_far: SoFar | None = None) -> Tensor:
         total, count = so_far or (self.descriptors.sum(0), len(self.descriptors))
         asked = self.descriptors[queries.to(self.descriptors.device)]
         asked = flipped(asked, seed, middle(total, count, self.place_map.mean))
@@ -228,9 +229,11 @@ class Wrapped(Scorer):
 
     @property
     def null(self) -> Null | None:  # type: ignore[override]
-        if (null := self.scorer.null) is None:
-            return None
-        return lambda queries, *how, **so: self.changed(null(self.asked(queries), *how, **so), queries)
+        return None if self.scorer.null is None else self.mirrored
+
+    def mirrored(self, queries: Tensor, seed: int = 0, so_far: SoFar | None = None) -> Tensor:
+        so = {} if so_far is None else {"so_far": so_far}
+        return self.changed(self.scorer.mirrored(self.asked(queries), seed=seed, **so), queries)
 
     @property
     def least(self) -> float:  # type: ignore[override]
@@ -306,7 +309,7 @@ class BestOf(Wrapped):
 
     def rows(self, queries: Tensor) -> Tensor:
         scores = self.scorer.rows(self.asked(queries))
-        self.last = queries, scores, None
+        self.last = (queries, scores, None) if scores.numel() <= SCORES_AT_ONCE else None
         return self.changed(scores, queries)
 
     def best(self, queries: Tensor, wanted: Wanted) -> Lowest:
@@ -323,10 +326,11 @@ class BestOf(Wrapped):
 
     def _copy_at(self, queries: Tensor, places: Tensor) -> Tensor:
         """Which copy of each query answers at places, (B,), (B,k) -> (B,k)."""
-        if self.last is None or self.last[0] is not queries:
-            self.rows(queries)
-        assert self.last is not None
-        _, scores, known = self.last
+        known: Tensor | None = None
+        if self.last is not None and self.last[0] is queries:
+            _, scores, known = self.last
+        else:
+            scores = self.scorer.rows(self.asked(queries))
         if known is None:
             at = places.clamp(min=0)[:, None].expand(-1, self.copies, -1).to(scores.device)
             return scores.view(-1, self.copies, self.layout.places).gather(2, at).argmin(1)

@@ -371,9 +371,10 @@ class PlaceSmoother(SequenceModel):
         return self.taught(samples, ranks, spacing, means)
 
     def forgetful(self) -> Self:
-        """A copy without what an earlier drive told."""
-        forgotten = dict.fromkeys(("log_likelihood", "singly"))
-        return self.changed(is_drive=False, nats_per_query=0.0, jumps=0.0, **forgotten)
+        """A copy with parameters of its own, without what an earlier drive told."""
+        own = {name: nn.Parameter(rate.detach().clone()) for name, rate in self.named_parameters()}
+        told = {"log_likelihood": None, "singly": None, "nats_per_query": 0.0, "jumps": 0.0}
+        return self.changed(is_drive=False, **told, **own)
 
     @torch.no_grad()
     def taught(

@@ -237,14 +237,14 @@ MUTANTS = [
     Mutant(
         "Map, matches and page of what was found are written before it is compared.",
         "dejavu_torch/evaluation/compare.py",
-        "if on_found is not None:",
-        "if on_found is None:",
+        "if reporting.on_found is not None:",
+        "if reporting.on_found is None:",
         ("tests/evaluation/test_demo.py::-k own_result",),
     ),
     Mutant(
         "Without --drives all only float and control are matched as whole drives.",
         "dejavu_torch/evaluation/compare.py",
-        "None if drives else DRIVEN",
+        'None if reporting.drives == "all" else DRIVEN',
         "None",
         ("tests/evaluation/test_compare.py::-k stands_beside_single",),
     ),
@@ -698,8 +698,8 @@ MUTANTS = [
     Mutant(
         "Where lengths count, half of each place's mean score stays.",
         "dejavu_torch/model.py",
-        "return way.having(removed=REMOVED) if self.descriptor.keeps_lengths else way",
-        "return way",
+        "removed=REMOVED if self.descriptor.keeps_lengths else 1.0",
+        "removed=1.0",
         ("tests/features/test_whitening.py::-k told_by_the_file",),
     ),
     Mutant(
@@ -1118,8 +1118,8 @@ MUTANTS = [
     Mutant(
         "Single images beside a drive have probabilities.",
         "dejavu_torch/evaluation/compare.py",
-        "Matching(how.sequence, platt=platt) if drive",
-        "Matching(how.sequence) if drive",
+        "Matching(platt=model.calibration and model.calibration.single)",
+        "Matching()",
         ("tests/evaluation/test_compare.py::-k single_images_beside",),
     ),
 ]

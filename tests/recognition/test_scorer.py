@@ -7,9 +7,10 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dejavu_torch import DejaVu, Layout, PlaceFilter, SpectralMapper
+from dejavu_torch import DejaVu, Layout, PlaceFilter, PlaceSmoother, SpectralMapper
 from dejavu_torch.maps.distance import phase_distances
-from dejavu_torch.recognition.localizer import Matching, answer
+from dejavu_torch.recognition.calibration import Platt
+from dejavu_torch.recognition.localizer import Localizer, Matching, answer
 from dejavu_torch.recognition.querying import Querying
 from dejavu_torch.recognition.scorer import BestOf, Earlier, OfMap, OfRows, OfStored, Reordered, Wrapped
 
@@ -125,3 +126,33 @@ def test_a_wrapper_changes_what_a_model_finds():
     assert float((found.index == torch.arange(80)).double().mean()) > 0.9
     several = model.localize_descriptors(queries, Matching(k=3, radius=5), lambda scorer: scorer)
     assert torch.equal(several.index, model.localize_descriptors(queries, Matching(k=3, radius=5)).index)
+
+
+def test_what_was_scored_last_is_not_kept_of_a_whole_flight(monkeypatch):
+    scores, every = noise(60, 7), torch.arange(30)
+    scorer = BestOf(OfRows(scores.__getitem__, noise(60, 3), Layout(7)), 2)
+    places = scorer.rows(every).argmin(1, keepdim=True)
+    assert scorer.last is not None
+    known = scorer.heading_at(every, places)
+    monkeypatch.setattr("dejavu_torch.recognition.scorer.SCORES_AT_ONCE", 60 * 7 - 1)
+    scorer.rows(every)
+    assert scorer.last is None
+    assert torch.equal(scorer.heading_at(every, places), known)
+
+
+def test_no_queries_have_no_headings(place_map):
+    for sequence in (None, PlaceFilter(), PlaceSmoother()):
+        match = answer(OfMap(place_map, noise(0, 6)), Matching(sequence, wrappers=TWO))
+        assert len(match) == 0
+
+
+def test_a_filter_asks_once_how_faithful_its_map_is(place_map, monkeypatch):
+    asked, plain = [], type(place_map).fidelity
+    monkeypatch.setattr(
+        type(place_map), "fidelity", property(lambda self: asked.append(1) or plain.fget(self))
+    )
+    localizer = Localizer(place_map, Matching(PlaceFilter(), platt=Platt(1.0, 0.0)))
+    for query in noise(12, 6, seed=1).split(1):
+        localizer(query)
+    assert len(asked) == 1
+    assert len(localizer.running.counts[1]) > 0

@@ -347,6 +347,15 @@ def test_scores_may_be_made_as_they_are_asked_for():
     assert again == repr(given_)
 
 
+def test_a_fitted_copy_shares_no_parameter():
+    smoother = PlaceSmoother()
+    for queries in (0, 60):
+        fitted = smoother.fit(shown(30, range(30))[:queries])
+        fitted.double()
+        assert {rate.dtype for rate in fitted.parameters()} == {torch.float64}
+        assert {rate.dtype for rate in smoother.parameters()} == {torch.float32}
+
+
 @given(st.integers(1, 5000), st.floats(1, 2000))
 def test_stretches_are_spread_over_the_drive(queries, correlation):
     picked = stretches(queries, correlation)
