@@ -496,8 +496,8 @@ class DejaVu(nn.Module):
         search: Search | None = None,
         apart: int = 5,
     ) -> Iterator[Match]:
-        """As `localize`, with `top` as `candidates`, or as `loops`: one batch of queries at a time, in constant
-        memory, or after the descriptors of all with a smoother, centred queries or several headings."""
+        """As `localize`, with `top` as `candidates`, or as `loops`: one batch of queries at a time, in
+        constant memory, or after the descriptors of all with a smoother, centred queries or headings."""
         require_map(self)
         if querying.top is not None:
             check_candidates(querying.top, apart, self.map.places)

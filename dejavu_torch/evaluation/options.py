@@ -79,7 +79,7 @@ class Learning:
         compared before one of them is measured."""
         seconds = [] if self.views is not None else several(self.second)
         named = None if isinstance(self.calibration, LabelledFrames) else self.calibration
-        if named == NO_CALIBRATION or (isinstance(named, Traverse) and self.calibration_truth is None):
+        if named == NO_CALIBRATION or (not isinstance(named, str) and self.calibration_truth is None):
             named = None
         if self.second is None:
             check_no_truth("second", self.second_truth)
