@@ -284,7 +284,9 @@ class Earlier(Wrapped):
 
     def changed(self, scores: Tensor, queries: Tensor) -> Tensor:
         blank = ~self.descriptors[queries.to(self.descriptors.device)].any(1, keepdim=True)
-        return earlier(scores, queries, self.apart).masked_fill(blank.to(scores.device), math.inf)
+        place = torch.arange(scores.shape[1], device=scores.device)
+        closed = place >= (queries[:, None] - self.apart).to(scores.device)
+        return scores.masked_fill(closed | blank.to(scores.device), math.inf)
 
 
 class BestOf(Wrapped):
@@ -337,12 +339,6 @@ class BestOf(Wrapped):
         each, (scores, known) = scores.shape[1], (one.view(len(queries), -1) for one in (scores, known))
         other = known[:, None] != places[..., None].to(known.device)
         return scores[:, None].expand_as(other).masked_fill(other, math.inf).argmin(2) // each
-
-
-def earlier(scores: Tensor, numbers: Tensor, apart: int) -> Tensor:
-    """Scores (B,N) of the places `numbers` (B,) as queries, infinite but for those over `apart` before."""
-    place = torch.arange(scores.shape[1], device=scores.device)
-    return scores.masked_fill(place >= (numbers[:, None] - apart).to(scores.device), math.inf)
 
 
 def of_stored(scores: Tensor, stored: Tensor) -> Tensor:

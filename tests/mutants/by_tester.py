@@ -691,8 +691,8 @@ MUTANTS = [
     Mutant(
         "A frame finds no loop to itself, or to the frames just before it.",
         "dejavu_torch/recognition/scorer.py",
-        "place >= (numbers[:, None] - apart)",
-        "place > (numbers[:, None] - apart)",
+        "place >= (queries[:, None] - self.apart)",
+        "place > (queries[:, None] - self.apart)",
         ("tests/test_loops.py::-k second_lap",),
     ),
     Mutant(
