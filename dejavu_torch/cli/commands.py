@@ -79,15 +79,7 @@ def run_learn(
     _check_map_file(map, *sources, *learning.files, growing.average, growing.average_truth)
     learning.seed_whitening(model)
     growing.check(sources, learning.calibration)
-    traverse: Traverse | None = None
-    if sources:
-        opened = [open_source(one) for one in sources]
-        for one in opened if len(opened) > 1 else ():
-            expected = "one area alone, of which --append adds more to its map"
-            one.layout.expect_route(expected, f"{one.name} is an area, one of {len(opened)} sources")
-        chain = chained(opened)
-        traverse = model.resample(chain, model.step, True, model.frame_shape)
-        print_steps(traverse)
+    traverse = _along(model, sources) if sources else None
     visits = None if growing.average is None else growing.visits(model, traverse)
     learning.check_calibrated(model, visits.traverse if traverse is None else traverse)  # type: ignore[union-attr]
     traverse, beside = learning.with_views(model, traverse)
@@ -130,6 +122,17 @@ def run_learn(
     if done:
         say(done)
     print_localize(map, model, command)
+
+
+def _along(model: DejaVu, sources: Sequence[str]) -> Traverse:
+    """The sources as one traverse, which follow each other, at the model's steps."""
+    opened = [open_source(one) for one in sources]
+    for one in opened if len(opened) > 1 else ():
+        expected = "one area alone, of which --append adds more to its map"
+        one.layout.expect_route(expected, f"{one.name} is an area, one of {len(opened)} sources")
+    traverse = model.resample(chained(opened), model.step, True, model.frame_shape)
+    print_steps(traverse)
+    return traverse
 
 
 def run_export(

@@ -20,12 +20,11 @@ from dejavu_torch.recognition.filter import near_scores
 from dejavu_torch.recognition.flight import place_flight
 from dejavu_torch.recognition.large import TILE, LargeDrive, is_large
 from dejavu_torch.recognition.plane import FLOWN
-from dejavu_torch.recognition.scorer import Scorer
+from dejavu_torch.recognition.scorer import Cached, Scorer
 from dejavu_torch.recognition.select import best_candidates
 from dejavu_torch.recognition.smoother import (
     Drive,
     PlaceSmoother,
-    Rows,
     blocks_together,
     check_descriptors,
     normalised,
@@ -216,7 +215,9 @@ def _seen(
         fitted.setdefault(kind, []).append((i, asked, smoother.drive(scorer.rows, descriptors, spacing)))
     for (queries, states, _), alike in fitted.items():
         every = len(alike) * queries * states.places <= SCORES_KEPT
-        alike = [(i, asked, drive._replace(rows=_kept(drive.rows, every))) for i, asked, drive in alike]
+        alike = [
+            (i, asked, drive._replace(rows=Cached(asked.scorer, every).rows)) for i, asked, drive in alike
+        ]
         pairs = [(asked.smoother, drive) for _, asked, drive in alike]
         for block in blocks_together(pairs, drives[alike[0][0]].scorer.layout.starts):
             numbers = torch.arange(block.first, block.first + block.log.shape[-1])
@@ -246,22 +247,6 @@ def _of_windows(asked: DriveQuery, progress: bool) -> Iterator[tuple[DriveQuery,
         for part in reversed(torch.arange(len(mass)).split(max(1, TILE // places))):
             whole = mass.new_zeros(len(part), places).index_copy(1, known, mass[part])
             yield asked, Seen(whole, scorer.rows(first + part).cpu())
-
-
-def _kept(rows: Rows, every: bool) -> Rows:
-    """The same rows of consecutive queries, which a sweep asks for again on its way back: the blocks that it
-    got, or the last one alone, are kept."""
-    blocks: dict[int, Tensor] = {}
-
-    def known(numbers: Tensor) -> Tensor:
-        first = int(numbers[0])
-        if first not in blocks or len(blocks[first]) != len(numbers):
-            if not every:
-                blocks.clear()
-            blocks[first] = rows(numbers)
-        return blocks[first]
-
-    return known
 
 
 def _mass(posterior: Tensor) -> Tensor:

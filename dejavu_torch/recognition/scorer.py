@@ -1,6 +1,6 @@
 """Scores of queries at places, computed where they are read: of a map, of stored frames, and wrapped.
 
-Wrappers are composed from inside out: `Reordered`, `BestOf`, `Earlier`.
+Wrappers are composed from inside out: `Reordered`, `BestOf`, `Earlier`, `Cached`.
 """
 
 from __future__ import annotations
@@ -339,6 +339,23 @@ class BestOf(Wrapped):
         each, (scores, known) = scores.shape[1], (one.view(len(queries), -1) for one in (scores, known))
         other = known[:, None] != places[..., None].to(known.device)
         return scores[:, None].expand_as(other).masked_fill(other, math.inf).argmin(2) // each
+
+
+class Cached(Wrapped):
+    """Scores of consecutive queries, of which a sweep asks again on its way back: those of every block, or of
+    the last one alone, are kept."""
+
+    def __init__(self, scorer: Scorer, every: bool) -> None:
+        super().__init__(scorer)
+        self.every, self.known = every, dict[int, Tensor]()
+
+    def rows(self, queries: Tensor) -> Tensor:
+        first = int(queries[0])
+        if first not in self.known or len(self.known[first]) != len(queries):
+            if not self.every:
+                self.known.clear()
+            self.known[first] = self.scorer.rows(queries)
+        return self.known[first]
 
 
 def of_stored(scores: Tensor, stored: Tensor) -> Tensor:

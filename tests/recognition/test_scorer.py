@@ -12,7 +12,16 @@ from dejavu_torch.maps.distance import phase_distances
 from dejavu_torch.recognition.calibration import Platt
 from dejavu_torch.recognition.localizer import Localizer, Matching, answer
 from dejavu_torch.recognition.querying import Querying
-from dejavu_torch.recognition.scorer import BestOf, Earlier, OfMap, OfRows, OfStored, Reordered, Wrapped
+from dejavu_torch.recognition.scorer import (
+    BestOf,
+    Cached,
+    Earlier,
+    OfMap,
+    OfRows,
+    OfStored,
+    Reordered,
+    Wrapped,
+)
 
 TWO = Querying(headings=2).wrappers
 
@@ -156,3 +165,13 @@ def test_a_filter_asks_once_how_faithful_its_map_is(place_map, monkeypatch):
         localizer(query)
     assert len(asked) == 1
     assert len(localizer.running.counts[1]) > 0
+
+
+@pytest.mark.parametrize("every", [True, False])
+def test_scores_that_are_cached_are_computed_once(every):
+    scores, asked = noise(9, 5), list[int]()
+    rows = lambda numbers: asked.extend(numbers.tolist()) or scores[numbers]  # noqa: E731
+    scorer = Cached(OfRows(rows, noise(9, 3), Layout(5)), every)
+    for first in (0, 3, 6, 6, 3, 0):  # there and back
+        assert torch.equal(scorer.rows(torch.arange(first, first + 3)), scores[first : first + 3])
+    assert asked == [*range(9)] if every else asked == [*range(9), 3, 4, 5, 0, 1, 2]
