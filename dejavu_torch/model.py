@@ -6,7 +6,7 @@ import copy
 import inspect
 import logging
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
@@ -16,8 +16,8 @@ from torch.nn.parameter import is_lazy
 
 from dejavu_torch import learning, model_file
 from dejavu_torch.data.source import Source, as_traverse
-from dejavu_torch.data.traverse import at_size, resize_like, size_like
-from dejavu_torch.data.turning import Turned, facing_north
+from dejavu_torch.data.traverse import Part, at_size, resize_like, size_like
+from dejavu_torch.data.turning import Turned
 from dejavu_torch.features.descriptor import Descriptor, own_size
 from dejavu_torch.features.extract import features_of
 from dejavu_torch.features.joined import Joined
@@ -40,6 +40,7 @@ from dejavu_torch.recognition.scorer import OfMap, Scorer
 from dejavu_torch.recognition.search import Scan, Search, Searcher, check_search
 from dejavu_torch.recognition.select import HIGHEST, PROBABLE, Acceptance, check_candidates
 from dejavu_torch.recognition.smoother import PlaceSmoother
+from dejavu_torch.recognition.views import ALONE, FIRST, LEAST, SHIFTS, BestView, Views
 from dejavu_torch.resize import reduced_size
 from dejavu_torch.types import Facts, InputError, Match, SequenceModel, Traverse, expect
 
@@ -111,6 +112,7 @@ class DejaVu(nn.Module):
     trained: Training | None
     frame_names: list[str]
     calibration: Calibration | None
+    views: Views | None
 
     def __init__(
         self,
@@ -387,6 +389,7 @@ class DejaVu(nn.Module):
         search: Search | None = None,
         centre: bool | None = None,
         headings: int = 1,
+        shifts: Literal["auto", "none"] | Sequence[float] = "auto",
     ) -> Match:
         """Section III-C: the best place of each query and whether it is accepted (eq. 5, eq. 6).
 
@@ -405,13 +408,15 @@ class DejaVu(nn.Module):
                 the H copies, whose heading `Match.heading` has. Describing and search take H times as long.
                 With 1, images are turned by their own `Traverse.headings`, if these are known. What
                 turned images have in common is removed, see `set_apart`.
+            shifts: views of each image, moved sideways, of which the best answers, for a camera that points
+                a little further right or left than at learning; see `Querying`. `Match.shift` says how far.
 
         Shape: -> Match of (Q,) on the CPU.
 
         Raises:
             InputError: no map, no frames, NaN, or features of another dimension than the map's.
         """
-        parts = [*self.matches(queries, _querying(sequence, centre, headings), progress, search)]
+        parts = [*self.matches(queries, _querying(sequence, centre, headings, shifts), progress, search)]
         return Match.joined(parts)
 
     def localize_descriptors(
@@ -512,13 +517,17 @@ class DejaVu(nn.Module):
             return
         queries = self.at_map_size(queries, self.frame_shape or ())
         matching = self.matching(sequence, search)
-        matching = matching._replace(k=querying.top, radius=apart, wrappers=querying.wrappers)
-        localizer = self.localizer(matching)
+        self._searcher(matching)  # refuses what does not fit
         if sequence is not None:
             sequence.check(len(queries), self.map.places)
         if self.step is not None:
             queries = self.resample(queries, self.step, progress, self.frame_shape)
-        queries = facing_north(queries, self.map.layout, headings)
+        ordered = queries.ordered or sequence is not None if ordered is None else ordered
+        whole = sequence is not None and sequence.whole
+        centres = querying.centres(whole and self.centres(len(queries))) and (whole or sequence is None)
+        querying = self.looking(queries, querying, ordered, centres)
+        matching = matching._replace(k=querying.top, radius=apart, wrappers=querying.wrappers)
+        count, queries = len(queries), querying.copies_of(queries, self.map.layout)
         shape, name = queries.frame_shape, queries.name
 
         def on_first(frames: Tensor, features: Tensor) -> None:
@@ -526,17 +535,45 @@ class DejaVu(nn.Module):
             self.descriptor.warn_of_bright(frames, name)
 
         turned = isinstance(queries, Turned)
-        whole = sequence is not None and sequence.whole
-        if not (whole or (querying.centres(False) and not turned) or headings > 1):
+        learns = querying.views.learns and sequence is None  # of single images: from those after them, too
+        if not (whole or (querying.centres(False) and not turned) or headings > 1 or learns):
+            localizer = self.localizer(matching.as_it_drives())
             batches = self.descriptor.batches(queries, progress, "localizing", on_first)
             yield from map(localizer, (set_apart(self.map, rows) if turned else rows for rows in batches))
             return
         descriptors = self.descriptor.all_of(queries, progress, on_first)
         if turned:
             descriptors = set_apart(self.map, descriptors)
-        elif querying.centres(self.centres(len(descriptors))):
-            descriptors = centred(self.map, descriptors)
+        elif centres:
+            descriptors = centred(self.map, descriptors, len(descriptors) // count)
         yield answer(self.scorer(descriptors, matching), matching, progress)
+
+    def looking(self, queries: Traverse, querying: Querying, ordered: bool, centre: bool = False) -> Querying:
+        """How queries are matched, with the views that are compared.
+
+        Args:
+            queries: as they are, described as the map's frames. ordered: one drive. centre: see `localize`.
+
+        Raises:
+            InputError: views of ready features, of an area or on a template map, or shifts out of range.
+        """
+        layout, asked, known = self.map.layout, querying.shifts, self.state.views
+        images = len(queries.frame_shape) == 3 and layout.dimensions == 1 and self.map.fidelity is not None
+        learns = ordered and len(queries) >= LEAST
+        if not isinstance(asked, str):
+            seen = f"shifts {asked} of {queries.name} on this map"
+            expect(images and querying.headings == 1, "images, on the spectral map of a route", seen)
+            return replace(querying, views=Views.given(asked, learns))
+        if asked == "none" or not images or querying.headings > 1 or known == ALONE:
+            return replace(querying, views=ALONE)
+        views = replace((known or ALONE).among(), learns=learns)
+        if learns:
+            first = Part(queries, range(min(FIRST, len(queries))))
+            rows = self.descriptor.all_of(views.of(first))
+            best = views(self.scorer(centred(self.map, rows, len(SHIFTS)) if centre else rows))
+            learns = isinstance(best, BestView) and best.kept.tolist() != [0]
+        useful = learns or len(views.known[0]) > 1
+        return replace(querying, views=views if useful else ALONE)
 
     def centres(self, queries: int) -> bool:
         """Whether so many consecutive queries are centred by default."""
@@ -551,11 +588,12 @@ class DejaVu(nn.Module):
         search: Search | None = None,
         centre: bool | None = None,
         headings: int = 1,
+        shifts: Literal["auto", "none"] | Sequence[float] = "auto",
     ) -> Match:
         """The k best places of each query; the first is that of `localize`.
 
         Args:
-            queries, sequence, search, centre, headings: see `localize`.
+            queries, sequence, search, centre, headings, shifts: see `localize`.
             k: from 1 to the number of places.
             apart: suppression radius in places, at least 0: any two candidates of a query differ by more.
 
@@ -570,7 +608,7 @@ class DejaVu(nn.Module):
             >>> DejaVu().learn(wave).candidates(wave[20:22], k=3).index[:, 0]
             tensor([20, 21])
         """
-        querying = replace(_querying(sequence, centre, headings), top=k)
+        querying = replace(_querying(sequence, centre, headings, shifts), top=k)
         return Match.joined(self.matches(queries, querying, False, search, apart))
 
     def matching(self, sequence: SequenceModel | None = None, search: Search | None = None) -> Matching:
@@ -649,11 +687,15 @@ class DejaVu(nn.Module):
 
 
 def _querying(
-    sequence: SequenceModel | Literal["auto"] | None, centre: bool | None, headings: int
+    sequence: SequenceModel | Literal["auto"] | None,
+    centre: bool | None,
+    headings: int,
+    shifts: Literal["auto", "none"] | Sequence[float],
 ) -> Querying:
     """The options of `localize` as one object."""
     mean: Literal["mean", "none"] | None = None if centre is None else "mean" if centre else "none"
-    return Querying(centre=mean, headings=headings).by(sequence)
+    shifts = shifts if shifts in ("auto", "none") else [*shifts]
+    return Querying(centre=mean, headings=headings, shifts=shifts).by(sequence)
 
 
 def _state_of(model: DejaVu, place_map: PlaceMap, traverse: Traverse | None) -> model_file.ModelState:

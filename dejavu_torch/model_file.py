@@ -41,6 +41,7 @@ from dejavu_torch.motion.odometry import GroundOdometry
 from dejavu_torch.periods.imposed import ImposedPeriods
 from dejavu_torch.periods.spectrogram import SpectrogramAnalysis
 from dejavu_torch.recognition.calibration import MARGIN, Calibration, Platt
+from dejavu_torch.recognition.views import Views
 from dejavu_torch.text import one_line
 from dejavu_torch.types import Facts, InputError, Training, Traverse, expect
 from dejavu_torch.version import __version__
@@ -90,6 +91,8 @@ class ModelState:
         trained: how the features or the map were trained, if they were.
         frame_names: of the reference; empty if it has none.
         calibration: probabilities of right answers.
+        views: of images alone, which other visits have shown; `ALONE` where moved images show other places of
+            the route. None if nothing is known.
     """
 
     frame_shape: tuple[int, ...] | None = None
@@ -97,6 +100,7 @@ class ModelState:
     trained: Training | None = None
     frame_names: list[str] = field(default_factory=list)
     calibration: Calibration | None = None
+    views: Views | None = None
 
 
 class Model(Protocol):
@@ -237,7 +241,8 @@ def state_to_json(state: ModelState) -> Facts:
     }
     trained = state.trained and state.trained._asdict()
     values = {"frame_shape": state.frame_shape, "step": state.step, "trained": trained, "names": names}
-    return values | {"calibration": calibration}
+    views = {"views": [*zip(*state.views.known, strict=True)]} if state.views is not None else {}
+    return values | {"calibration": calibration, **views}
 
 
 def state_from_json(values: Facts, frames: int | None = None) -> ModelState:
@@ -251,6 +256,7 @@ def state_from_json(values: Facts, frames: int | None = None) -> ModelState:
         trained and Training(**trained),
         [] if values["names"] is None else decode_names(values["names"], frames),
         calibration,
+        (pairs := values.get("views")) and Views(*map(tuple, zip(*pairs, strict=True))),  # type: ignore[arg-type]
     )
 
 

@@ -31,7 +31,7 @@ from dejavu_torch.data.turning import Turned, facing_north
 from dejavu_torch.evaluation.baselines import Baseline, baselines_of, matched
 from dejavu_torch.evaluation.contenders import COLOURS, Contender, contend, models_beside
 from dejavu_torch.evaluation.evaluate import RANKS
-from dejavu_torch.evaluation.facts import facts_of, match_facts, metric_facts, peak_memory
+from dejavu_torch.evaluation.facts import facts_of, match_facts, metric_facts, peak_memory, view_facts
 from dejavu_torch.evaluation.localization import NOTHING, Localization
 from dejavu_torch.evaluation.options import (
     LEARNING,
@@ -55,7 +55,7 @@ from dejavu_torch.places.layout import Reach
 from dejavu_torch.recognition.centring import centred
 from dejavu_torch.recognition.localizer import Matching, answer
 from dejavu_torch.recognition.querying import QUERYING, Querying
-from dejavu_torch.recognition.scorer import Scorer
+from dejavu_torch.recognition.scorer import Repeated, Scorer
 from dejavu_torch.recognition.select import check_candidates
 from dejavu_torch.recognition.smoother import PlaceSmoother
 from dejavu_torch.types import Facts, InputError, Match, SequenceModel, Traverse, expect
@@ -138,7 +138,7 @@ class Plan(NamedTuple):
         beside = wanted and self.querying.headings == 1 and queries * places <= most
         also = models_beside(None if whole else way, beside, queries, places, reach)
         also = {key: one for key, one in also.items() if key == "filter" or FOLLOWS[dimensions]}
-        matching = Matching(None if whole else way, also, wrappers=self.querying.wrappers)
+        matching = Matching(None if whole else way, also, wrappers=run.querying.wrappers)
         return matching, whole, PlaceSmoother(within=reach) if beside and queries > 1 else None
 
 
@@ -181,7 +181,7 @@ def compare(
         with plan.learning.calibrated(model, plan.reference, plan.within(run.truth), reporting.progress):
             run, ranked, candidates = _answered(plan, run)
             way = plan.way and plan.way.having(within=plan.within(run.truth))
-            off_map = found_elsewhere(run, plan.off, way, plan.centring, reporting.progress)
+            off_map = found_elsewhere(run, plan.off, way, plan.ordered, plan.centring, reporting.progress)
         model.cpu()
         found = _told(plan, run, ranked, off_map)._replace(candidates=candidates)
         if reporting.on_found is not None:
@@ -322,7 +322,10 @@ def _learned(plan: Plan) -> Localization:
 def _answered(plan: Plan, run: Localization) -> tuple[Localization, Match, Match]:
     """The run with its answers, and the best places of each query, as far as recall@N needs, and, for its
     answer, as far as `top` needs."""
-    model, querying, progress = plan.model, plan.querying, plan.reporting.progress
+    model, progress, causal = plan.model, plan.reporting.progress, plan.way is not None and not plan.way.whole
+    with timed(plan.seconds, "localize"):
+        querying = model.looking(run.query, plan.querying, plan.ordered, plan.centring and not causal)
+    run = run._replace(querying=querying)
     matching, whole, beside = plan.ways(run)
     ranks = max(querying.ranks, min(max(RANKS), model.map.places))
 
@@ -335,7 +338,9 @@ def _answered(plan: Plan, run: Localization) -> tuple[Localization, Match, Match
             run = run._replace(query_features=run.described_by(model, progress))
         queries, way = run.query_features, matching.sequence
         if plan.centring and not isinstance(run.asked, Turned):
-            run = run._replace(query_features=centred(model.map, queries), causal_features=queries)
+            run = run._replace(
+                query_features=centred(model.map, queries, querying.copies), causal_features=queries
+            )
         if way is not None:
             way.check(len(run.query), model.map.places)
         # beside a drive nobody asks which single images are accepted
@@ -373,6 +378,7 @@ def _told(plan: Plan, run: Localization, ranked: Match, off_map: dict[str, Tenso
         **match_facts(run, ranked, truth, interpolate, off_map),
         "centred": plan.centring,
         **({"headings": headings} if headings > 1 else {}),
+        **view_facts(run),
         **metric_facts(run, truth),
         **({"second": views.placed_facts()} if views is not None and views.placed else {}),
     }
@@ -390,7 +396,8 @@ def _contenders(plan: Plan, run: Localization) -> dict[str, Contender]:
         if judged or reporting.leave_out is not None:
             yield from baselines_of(run, plan.learning.seed, reporting.leave_out, progress)
         for key, (name, bytes, given) in reporting.contenders.items():
-            yield key, Baseline(name, given, bytes)
+            views = len(run.querying.views.shifts)
+            yield key, Baseline(name, given if views == 1 else Repeated(given, views), bytes)
         for key, (name, other) in reporting.others.items() if judged else ():
             other.learn(run.reference, progress)
             scorer, size = other.scorer(run.described_by(other, progress), run.matching), other.summary()

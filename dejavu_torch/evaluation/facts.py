@@ -20,6 +20,8 @@ from dejavu_torch.maps.distance import l1_backend
 from dejavu_torch.maps.summary import MapSummary
 from dejavu_torch.motion.resampling import ResampledTraverse, source_of
 from dejavu_torch.periods.spectrogram import BACKEND
+from dejavu_torch.recognition.scorer import OfMap
+from dejavu_torch.recognition.views import BestView
 from dejavu_torch.text import plain_number
 from dejavu_torch.types import Facts, Match
 
@@ -108,6 +110,19 @@ def match_facts(
         radius, unit = run.reach
         alone |= extent | {"unit": unit, "tolerance": plain_number(radius), "truth": words}
     return facts | alone
+
+
+def view_facts(run: Localization) -> Facts:
+    """The entry `views` of report.json, if images were also compared moved sideways: by its shift the penalty
+    of each view that answers, and the median shift of the answers."""
+    best = run.querying.views(OfMap(run.model.map, run.query_features))
+    if not isinstance(best, BestView):
+        return {}
+    own = zip(best.kept.tolist(), best.penalties[0].tolist(), strict=True)
+    penalties = {f"{best.shifts[copy]:g}": round(penalty, 4) for copy, penalty in own}
+    shift = run.match.shift
+    known = [] if shift is None else shift[~shift.isnan()].sort().values.tolist()
+    return {"views": {"penalties": penalties, "shift": known[len(known) // 2] if known else None}}
 
 
 def metric_facts(run: Localization, truth: Truth | None) -> Facts:

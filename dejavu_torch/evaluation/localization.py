@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from dejavu_torch.data.ground_truth import GroundTruth, scored_and_right
-from dejavu_torch.data.turning import Turned, facing_north
+from dejavu_torch.data.turning import Turned
 from dejavu_torch.evaluation.contenders import Contender, contend
 from dejavu_torch.model import DejaVu
 from dejavu_torch.motion.resampling import ResampledTraverse
@@ -27,7 +27,7 @@ NOTHING = Match(torch.zeros(0, dtype=torch.int64), torch.zeros(0), torch.zeros(0
 class Localization(NamedTuple):
     """A map, its reference traverse, a query traverse, and the matches.
 
-    reference_features (N,D) and query_features (Q,D), or those of all turned copies, may lie in a file.
+    reference_features (N,D) and query_features (Q,D), or those of all copies, may lie in a file.
     truth: None if unknown. tolerance: in places, inclusive. matching: for the map and all baselines.
     querying: as asked for. causal_features: the queries for sequences and filters, if query_features are
     centred, which takes all of them. match: the answers. judged: the matches that the scores at top level
@@ -68,8 +68,8 @@ class Localization(NamedTuple):
 
     @property
     def asked(self) -> Traverse:
-        """The frames whose descriptors the queries have: all turned copies, if several headings are tried."""
-        return facing_north(self.query, self.model.map.layout, self.querying.headings)
+        """The frames whose descriptors the queries have: all copies, if there are several of them."""
+        return self.querying.copies_of(self.query, self.model.map.layout)
 
     def described_by(self, model: DejaVu, progress: bool = False) -> Tensor:
         """The descriptors of the queries by a model, those of turned images by `set_apart`."""
@@ -116,7 +116,7 @@ class Localization(NamedTuple):
         """(Q,) the frame of its source that each query shows."""
         if isinstance(self.query, ResampledTraverse):
             return self.query.frame
-        return torch.arange(len(self.query_features) // self.querying.headings)
+        return torch.arange(len(self.query_features) // self.querying.copies)
 
     @property
     def unit(self) -> str:

@@ -24,6 +24,7 @@ from dejavu_torch.types import InputError, Match
 
 log = logging.getLogger("dejavu_torch")
 
+TOLD = "probability", "confidence", "heading", "shift"  # if they are known
 NUMBERS, NAMES = ("query", "place", "score", "accepted"), ("query_name", "place_name")
 EXPECTED = "columns query,place,score and optionally accepted, probability, confidence, rank, route"
 ELSEWHERE = -2  # the place of an answer on another route
@@ -77,7 +78,7 @@ def write_matches(
     matches = iter(matches)
     start = next(matches, None)
     present = {} if start is None else start.columns
-    known = [name for name in ("probability", "confidence", "heading") if name in present]
+    known = [name for name in TOLD if name in present]
     with ExitStack() as stack:
 
         def opened(path: Path) -> TextIO:
@@ -95,13 +96,11 @@ def write_matches(
             queries = torch.arange(first, total) if query_frames is None else query_frames[first:total]
             places, own = table.frame_of(match.index), table.own_frame_of(match.index)
             rank = torch.arange(each).repeat(len(queries)) + 1
-            right, sure, turn = (
-                match.columns.get(name, match.score) for name in ("probability", "confidence", "heading")
-            )
+            right, sure, turn, aside = (match.columns.get(name, match.score) for name in TOLD)
             route, at = layout.route_of(match.index), layout.coordinates(match.index)
             whole = queries.repeat_interleave(each), places, own, match.accepted, rank, route
-            parts = match.score, right, sure, turn, *at.unbind(1)
-            for (query, place, number, good, order, on), (score, chance, margin, north, x, y) in zip(
+            parts = match.score, right, sure, turn, aside, *at.unbind(1)
+            for (query, place, number, good, order, on), (score, chance, margin, north, shift, x, y) in zip(
                 *(zip(*(column.tolist() for column in columns), strict=True) for columns in (whole, parts)),
                 strict=True,
             ):
@@ -113,6 +112,7 @@ def write_matches(
                     "probability": _number(chance),
                     "confidence": _number(margin),
                     "heading": _number(north),
+                    "shift": _number(shift, 3),
                     "rank": order,
                     "route": printable(layout.names("")[on]) if on >= 0 else "",
                     "x": _number(x, 9),

@@ -13,7 +13,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from dejavu_torch.data.ground_truth import GroundTruth, scored_and_right
-from dejavu_torch.data.turning import Turned, facing_north
+from dejavu_torch.data.turning import Turned
 from dejavu_torch.evaluation.activation import share
 from dejavu_torch.evaluation.curves import evaluate
 from dejavu_torch.evaluation.plots import DARK, GREY, RIGHT, Pictures, canvas, picture
@@ -54,7 +54,12 @@ def reach_of(tolerance: int, truth: GroundTruth | None, near: bool = False) -> i
 
 
 def found_elsewhere(
-    run: Localization, off: Sequence[Traverse], way: SequenceModel | None, centring: bool, progress: bool
+    run: Localization,
+    off: Sequence[Traverse],
+    way: SequenceModel | None,
+    ordered: bool,
+    centring: bool,
+    progress: bool,
 ) -> dict[str, Tensor]:
     """The probability of the match of each frame of routes off the map, (n,) by name; none without a
     calibration."""
@@ -63,13 +68,15 @@ def found_elsewhere(
         log.warning("the map is not calibrated, so no frame of other routes has a probability")
         return {}
     for other in off:
-        asked = facing_north(other, model.map.layout, run.querying.headings)
+        centres = centring and (way is None or way.whole)
+        querying = model.looking(other, run.querying, ordered, centres)
+        asked = querying.copies_of(other, model.map.layout)
         queries = model.descriptor.all_of(asked, progress)
         if isinstance(asked, Turned):
             queries = set_apart(model.map, queries)
-        elif centring and (way is None or way.whole):
-            queries = centred(model.map, queries)
-        matching = model.matching(way)._replace(wrappers=run.querying.wrappers)
+        elif centres:
+            queries = centred(model.map, queries, querying.copies)
+        matching = model.matching(way)._replace(wrappers=querying.wrappers)
         match = model.localize_descriptors(queries, matching)
         assert match.probability is not None
         probabilities[other.name] = match.probability

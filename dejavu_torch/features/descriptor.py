@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 
 import torch
 from torch import Tensor, nn
 
+from dejavu_torch.data.moving import Moved
 from dejavu_torch.data.traverse import Part
 from dejavu_torch.features.distilled import Distilled
 from dejavu_torch.features.extract import (
@@ -17,6 +18,7 @@ from dejavu_torch.features.extract import (
     feature_batches,
     features_of,
     in_mode,
+    moved_features,
     warn_of_bright,
     warn_of_raw,
 )
@@ -102,6 +104,11 @@ class Descriptor(nn.Module):
         features: Tensor = self.features(as_weights(self.preprocess(frames), self.features))
         return features
 
+    def describe_moved(self, frames: Tensor, shifts: Sequence[float]) -> Tensor:
+        """As `describe`, of copies that are moved sideways, see `Moved`: (B,C,H,W) -> (B,V,D)."""
+        features = moved_features(self.features, self.preprocess(frames), shifts)
+        return features * self.preprocess.shows(frames)[:, None, None].to(features)
+
     def whitened(self, features: Tensor) -> Tensor:
         """Features (B,D) -> descriptors (B,K); 0 for features of 0."""
         if self.whitening is None:
@@ -128,6 +135,8 @@ class Descriptor(nn.Module):
         height, width = own_size(self.features) or (1, 1)
         size = max(1, min(self.batch_size, BATCH_NUMBERS // (3 * height * width)))
         settings = self.device, progress, verb, on_first, self.describe
+        if isinstance(traverse, Moved):
+            return self._moved(traverse, size, progress, verb, on_first)
         windows = Windows.of(traverse) if shared else None
         if windows is not None and self.sharing.fits(windows.grid):
             return self._shared(windows, traverse, size, progress, verb, on_first)
@@ -139,6 +148,23 @@ class Descriptor(nn.Module):
             features = concatenate(feature_batches(traverse, self, size, *settings), len(traverse))
             self.known[key] = traverse, features  # which keeps its id
         return (part.to(self.device) for part in self.known[key][1].split(ROWS))
+
+    def _moved(
+        self, traverse: Moved, size: int, progress: bool, verb: str, on_first: OnFirst | None
+    ) -> Iterator[Tensor]:
+        """Features of the copies of each frame, which share what can be computed once."""
+        count = len(traverse.shifts)
+
+        def describe(frames: Tensor) -> Tensor:
+            return self.describe_moved(frames, traverse.shifts).flatten(1)
+
+        def first(frames: Tensor, features: Tensor) -> None:
+            if on_first is not None:
+                on_first(frames, features[:, : features.shape[1] // count])
+
+        settings = self.device, progress, verb, first, describe
+        for batch in feature_batches(traverse.traverse, self, size, *settings):
+            yield batch.unflatten(1, (count, -1)).flatten(0, 1)
 
     @property
     def sharing(self) -> Sharing:

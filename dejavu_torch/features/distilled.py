@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import torch
@@ -10,6 +10,7 @@ from safetensors.torch import load_file
 from torch import Tensor, nn
 from torch.nn.functional import adaptive_avg_pool2d, conv2d
 
+from dejavu_torch.data.moving import sideways
 from dejavu_torch.features.preprocess import check_frames
 from dejavu_torch.resize import resize_frames
 from dejavu_torch.text import settings_of
@@ -57,17 +58,31 @@ class Distilled(nn.Module):
             self.register_buffer(name, tensor, persistent=name == "checksum")
 
     def forward(self, frames: Tensor) -> Tensor:
+        return torch.cat([adaptive_avg_pool2d(part, self.grid).flatten(1) for part in self._maps(frames)])
+
+    def moved(self, frames: Tensor, shifts: Sequence[float]) -> Tensor:
+        """The features of frames moved sideways, see `Moved`, of feature maps that are computed once:
+        (B,C,H,W) -> (B,V,D)."""
+        count, found = len(shifts), []
+        for maps in self._maps(frames):
+            at = torch.arange(WIDEST, device=maps.device)
+            by = WIDEST * torch.tensor(shifts, device=maps.device)[:, None]
+            rows = adaptive_avg_pool2d(maps, (self.grid, WIDEST)).flatten(1, 2)
+            copies = sideways(rows, (at - by).flatten()).unflatten(2, (count, WIDEST))
+            cells = adaptive_avg_pool2d(copies, (count, self.grid))  # (B,40 x grid,V,grid)
+            found.append(cells.transpose(1, 2).flatten(2))
+        return torch.cat(found)
+
+    def _maps(self, frames: Tensor) -> Iterator[Tensor]:
+        """Feature maps of some frames at a time."""
         check_frames(frames, "Distilled got")
         if frames.shape[1] not in (1, 3):
             frames = frames.mean(1, keepdim=True)
         layers = dict(self.named_buffers())
         # a graph has one batch, and a GPU takes as long for few frames
         whole = torch.compiler.is_compiling() or frames.device.type != "cpu"
-        maps = (
-            distilled_maps(resize_frames(part, SIZE), layers)
-            for part in ([frames] if whole else frames.split(AT_ONCE))
-        )
-        return torch.cat([adaptive_avg_pool2d(part, self.grid).flatten(1) for part in maps])
+        for part in [frames] if whole else frames.split(AT_ONCE):
+            yield distilled_maps(resize_frames(part, SIZE), layers)
 
     def _load_from_state_dict(self, state: dict[str, Tensor], prefix: str, *args: object) -> None:
         stored = state.get(f"{prefix}checksum")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import cache
 from itertools import chain
@@ -11,6 +11,7 @@ from itertools import chain
 import torch
 from torch import Tensor, nn
 
+from dejavu_torch.data.moving import moved
 from dejavu_torch.features.preprocess import check_frames
 from dejavu_torch.features.views import AugmentedFrames
 from dejavu_torch.text import progress_of
@@ -93,6 +94,15 @@ def features_of(batch: Tensor, describe: Callable[[Tensor], Tensor], name: str =
         seen = f"{type(owner).__name__} made {output} of {tuple(batch.shape)}"
         raise InputError(f"{seen}; expected features ({len(batch)}, D)")
     return features
+
+
+def moved_features(features: nn.Module, frames: Tensor, shifts: Sequence[float]) -> Tensor:
+    """Features of frames moved sideways, see `Moved`, by the module's method `moved` if it has one, else of
+    moved frames: (B,C,H,W) -> (B,V,D)."""
+    frames = as_weights(frames, features)
+    if (own := getattr(features, "moved", None)) is not None:
+        return own(frames, shifts)  # type: ignore[no-any-return]
+    return features_of(moved(frames, shifts), features).view(len(frames), len(shifts), -1)
 
 
 def warn_of_bright(frames: Tensor, name: str) -> bool:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Sequence
 from typing import Literal
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from dejavu_torch.data.moving import sideways
 from dejavu_torch.features.preprocess import check_frames, in_parts
 from dejavu_torch.resize import check_size, resize_frames
 from dejavu_torch.text import settings_of
@@ -59,6 +61,29 @@ class HOG(nn.Module):
         cell = self.cell or cell_for(*(self.resize or frames.shape[2:]))
         return hog(frames, self.orientations, cell, self.block, self.resize, self.bins)
 
+    def moved(self, frames: Tensor, shifts: Sequence[float]) -> Tensor:
+        """The features of frames moved sideways, see `Moved`, by histograms that are computed once, of
+        quarters of a cell: (B,C,H,W) -> (B,V,D)."""
+        cell = self.cell or cell_for(*(self.resize or frames.shape[2:]))
+        parts = next(parts for parts in (4, 2, 1) if cell % parts == 0)
+        part = cell // parts
+
+        def described(some: Tensor) -> Tensor:
+            exact = some.to(torch.promote_types(some.dtype, torch.float32))
+            rows, columns = gradients(resize_frames(exact, self.resize))
+            ny, nx = (side // cell for side in rows.shape[1:])
+            rows, columns = rows[:, : ny * cell], columns[:, : ny * cell]
+            votes = cell_histograms(rows, columns, self.orientations, part, self.bins)
+            votes = F.avg_pool2d(votes.permute(0, 3, 1, 2), (parts, 1))  # (B,O,ny,columns of parts)
+            by = torch.tensor(shifts, device=votes.device)[:, None] * columns.shape[2] / part
+            at = torch.arange(nx * parts, device=votes.device) - by
+            cells = sideways(votes, at.flatten(), lambda seen: seen.flip(1))
+            cells = F.avg_pool2d(cells, (1, parts)).unflatten(3, (len(shifts), nx))
+            found = blocks_of(cells.permute(0, 3, 2, 4, 1).flatten(0, 1), self.block)
+            return found.view(len(some), len(shifts), -1)
+
+        return in_parts(described, frames).to(frames.dtype)
+
     def for_frames(self, height: int, width: int) -> HOG:
         """The same, but with the cell of frames of this size, if it was None: a map's file names it."""
         if not self.chooses:
@@ -95,10 +120,15 @@ def hog(
         exact = part.to(torch.promote_types(part.dtype, torch.float32))
         rows, columns = gradients(resize_frames(exact, resize))
         histograms = cell_histograms(rows, columns, orientations, cell, bins)
-        blocks = histograms.unfold(1, block, 1).unfold(2, block, 1)  # (B,by,bx,O,block,block)
-        return normalised(blocks.permute(0, 1, 2, 4, 5, 3).flatten(3)).flatten(1).to(part.dtype)
+        return blocks_of(histograms, block).to(part.dtype)
 
     return in_parts(described, frames)
+
+
+def blocks_of(histograms: Tensor, block: int) -> Tensor:
+    """Normalised overlapping blocks of the histograms of cells: (B,ny,nx,O) -> (B,D)."""
+    blocks = histograms.unfold(1, block, 1).unfold(2, block, 1)  # (B,by,bx,O,block,block)
+    return normalised(blocks.permute(0, 1, 2, 4, 5, 3).flatten(3)).flatten(1)
 
 
 def cell_for(*size: int) -> int:

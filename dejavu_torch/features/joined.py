@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from dejavu_torch.features.extract import as_weights, features_of
+from dejavu_torch.features.extract import as_weights, features_of, moved_features
 from dejavu_torch.features.preprocess import check_frames
 from dejavu_torch.types import InputError
 
@@ -51,6 +51,10 @@ class Joined(nn.Module):
         if not torch.compiler.is_compiling():  # a graph has no side effects
             self.groups = tuple(part.shape[1] for part in features)
         return torch.cat(features, 1)
+
+    def moved(self, frames: Tensor, shifts: Sequence[float]) -> Tensor:
+        """The features of frames moved sideways, see `Moved`: (B,C,H,W) -> (B,V,D)."""
+        return torch.cat([moved_features(member, frames, shifts) for member in self.members], 2)
 
 
 def groups_of(features: nn.Module) -> tuple[int, ...] | None:

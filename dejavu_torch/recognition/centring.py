@@ -15,12 +15,13 @@ SHRINKAGE = 0.25  # least share of the second moment of turned images that a mul
 PRIOR = 50  # queries that the map's own mean counts as; fewer queries are not centred by default
 
 
-def centred(place_map: PlaceMap, queries: Tensor) -> Tensor:
+def centred(place_map: PlaceMap, queries: Tensor, copies: int = 1) -> Tensor:
     """Queries without what all of them have and the map has not: q - sum w (q - m) / (sum w + 50).
 
     m is the mean descriptor of the map; w is 1 over the length of the stop that a query belongs to. For a map
     by cosine the results have norm 1. Queries of 0, as of blank frames, stay 0 and do not count. Those of
-    maps that are not spectral, and so have no mean, stay as they are.
+    maps that are not spectral, and so have no mean, stay as they are. Of several `copies` of each query, the
+    first counts.
 
     Shape: (Q,K) -> (Q,K).
 
@@ -28,8 +29,9 @@ def centred(place_map: PlaceMap, queries: Tensor) -> Tensor:
     """
     if not isinstance(place_map, SpectralMap) or not len(queries):
         return queries
-    weight = queries.any(1) / run_lengths(unchanged(queries)).to(queries)
-    shift = weight @ (queries - place_map.mean.to(queries))
+    own = queries[::copies]
+    weight = own.any(1) / run_lengths(unchanged(own)).to(queries)
+    shift = weight @ (own - place_map.mean.to(queries))
     return _without(place_map.metric, queries, shift / (weight.sum() + PRIOR))
 
 

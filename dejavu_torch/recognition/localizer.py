@@ -29,6 +29,7 @@ from dejavu_torch.recognition.taken import (
     Running,
     doubted,
 )
+from dejavu_torch.recognition.views import Views
 from dejavu_torch.text import with_progress
 from dejavu_torch.types import Match, SequenceModel, Together, expect
 
@@ -48,6 +49,11 @@ class Matching(NamedTuple):
     callback: Callable[[Tensor], None] | None = None  # receives the final scores (B,N)
     search: Search = "auto"  # of single queries, see `DejaVu.localize`
     wrappers: tuple[Callable[[Scorer], Scorer], ...] = ()  # of the scores, from inside out
+
+    def as_it_drives(self) -> Matching:
+        """The same for one drive whose queries come one after another."""
+        views = (one.as_it_drives() if isinstance(one, Views) else one for one in self.wrappers)
+        return self._replace(wrappers=tuple(views))
 
 
 SINGLE = Matching()  # each query by itself
@@ -131,14 +137,14 @@ class Localizer:
                 match = self._alone(*scorer.best(part, wanted))
             else:
                 match = self.match(scorer.rows(part), scorer.stored, self._mirrored(scorer, part))
-            parts.append(self._turned(match, scorer, part))
+            parts.append(self._told(match, scorer, part))
         return self._without_blank(Match.joined(parts), scorer)
 
     def _mirrored(self, scorer: Scorer, queries: Tensor) -> Tensor | None:
         """Confidences in some of the queries, mirrored, (B,), NaN for the others, if a filter's answers get
         probabilities."""
         if self.asks is None:
-            self.asks = scorer.copies == 1 and scorer.null is not None
+            self.asks = scorer.null is not None
         if not self.asks:
             return None
         descriptors = scorer.descriptors[queries.to(scorer.descriptors.device)]
@@ -174,10 +180,10 @@ class Localizer:
                 self._in_sequence(part, stored) for part in scores.split(max(1, CACHED // scores.shape[1]))
             )
 
-    def _turned(self, match: Match, scorer: Scorer, queries: Tensor) -> Match:
-        """The match of queries with its headings, if there are copies of them, and these answer now."""
+    def _told(self, match: Match, scorer: Scorer, queries: Tensor) -> Match:
+        """The match of queries with what copies tell of them, if these answer now."""
         late = self.matching.sequence is not None and self.matching.sequence.lag
-        return match if late else headed(match, scorer, queries)
+        return match if late else told(match, scorer, queries)
 
     def _without_blank(self, match: Match, scorer: Scorer) -> Match:
         """The match, in which blank frames find nothing by themselves."""
@@ -281,12 +287,12 @@ def judged(match: Match, matching: Matching, layout: Layout, acceptance: Accepta
     return match if matching.k is not None else match.map(lambda column: column[:, 0])
 
 
-def headed(match: Match, scorer: Scorer, queries: Tensor) -> Match:
-    """The match of queries (B,) with its headings, if there are copies of them."""
-    heading = scorer.heading_at(queries, match.index.view(len(queries), -1 if len(queries) else 1))
-    if heading is None:
-        return match
-    return replace(match, heading=heading.view_as(match.index).masked_fill(match.index < 0, torch.nan))
+def told(match: Match, scorer: Scorer, queries: Tensor) -> Match:
+    """The match of queries (B,) with what their copies tell, if there are some."""
+    columns = scorer.told(queries, match.index.view(len(queries), -1 if len(queries) else 1))
+    shape, lost = match.index.shape, match.index < 0
+    known = {name: one.view(shape).masked_fill(lost, torch.nan) for name, one in columns.items()}
+    return replace(match, heading=known.get("heading"), shift=known.get("shift"))
 
 
 def wrapped(scorer: Scorer, matching: Matching) -> Scorer:
@@ -305,12 +311,19 @@ def answer(
     way = matching.sequence
     if isinstance(way, PlaceSmoother):
         return _of_drive(scorer, way, matching, progress)
-    if scorer.uncentred is not None and (matching.also or way):
-        found = answer(scorer.uncentred, matching, progress, verb)
-        if way is not None:
-            return found
+    if matching.also and way is None and (scorer.uncentred is not None or matching.wrappers):
         alone = answer(scorer, matching._replace(also={}), progress, verb)
+        found = _as_it_drives(scorer, matching, progress, verb)
         return replace(alone, sequences=found.sequences)
+    if way is not None:
+        return _as_it_drives(scorer, matching, progress, verb)
+    return Localizer(None, matching, layout=scorer.layout).next(scorer, progress, verb)
+
+
+def _as_it_drives(scorer: Scorer, matching: Matching, progress: bool, verb: str) -> Match:
+    """Match all queries in order, none of which knows those after it."""
+    way, matching = matching.sequence, matching.as_it_drives()
+    scorer = scorer if scorer.uncentred is None else scorer.uncentred
     localizer = Localizer(None, matching, layout=scorer.layout)
     match = localizer.next(scorer, progress, verb)
     return Match.joined([match, localizer.finish()]) if way is not None and way.lag else match
@@ -329,4 +342,4 @@ def _of_drive(scorer: Scorer, smoother: PlaceSmoother, matching: Matching, progr
     if scorer.copies == 1:
         return match
     parts = torch.arange(len(scorer)).split(max(1, scorer.at_once // scorer.layout.places))
-    return Match.joined(headed(match[part], scorer, part) for part in parts)
+    return Match.joined(told(match[part], scorer, part) for part in parts)

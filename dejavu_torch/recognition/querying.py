@@ -4,18 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Literal
 
 from typing_extensions import Self
 
+from dejavu_torch.data.turning import facing_north
+from dejavu_torch.places.layout import Layout
 from dejavu_torch.recognition.filter import PlaceFilter
-from dejavu_torch.recognition.scorer import BestOf, Earlier, Scorer
+from dejavu_torch.recognition.scorer import BestHeading, Earlier, Scorer
 from dejavu_torch.recognition.sequence import SequenceMatcher
 from dejavu_torch.recognition.smoother import PlaceSmoother
+from dejavu_torch.recognition.views import ALONE, Views
 from dejavu_torch.text import refuse_with
-from dejavu_torch.types import InputError, SequenceModel, expect
+from dejavu_torch.types import InputError, SequenceModel, Traverse, expect
 
 WAYS = "drive, filter, single or sequence:T with a whole number T of at least 1"
 
@@ -96,6 +99,10 @@ class Querying(Sequences):
             before each frame, and all after it
         headings: tried per image on the map of an area, evenly over 360 degrees, such as 24, which takes 24
             times as long
+        shifts: views of each image, moved sideways, of which the best answers, for a camera that points a
+            little elsewhere than at learning: auto are those that the first 100 queries in order show to be
+            of use, or the map knows; none; or a list in shares of the width, such as '[-.1,.1]'
+        views: what `shifts` have come to, see `DejaVu.looking`.
     """
 
     ordered: bool = False
@@ -104,6 +111,8 @@ class Querying(Sequences):
     top: int | None = None
     loops: int | None = None
     headings: int = 1
+    shifts: Literal["auto", "none"] | list[float] = "auto"
+    views: Views = field(default=ALONE, metadata={"option": False})
 
     def order(self, matcher: SequenceModel | Literal["auto"] | None) -> bool | None:
         """Whether queries, matched so, are in order; None leaves it to their source."""
@@ -122,9 +131,19 @@ class Querying(Sequences):
 
     @property
     def wrappers(self) -> tuple[Callable[[Scorer], Scorer], ...]:
-        """Of the scores, from inside out: the best of all headings, only earlier places for loops."""
-        turned = [partial(BestOf, copies=self.headings)] if self.headings > 1 else []
-        return (*turned, *([partial(Earlier, apart=self.loops)] if self.loops is not None else []))
+        """Of the scores, from inside out: the best heading or view, only earlier places for loops."""
+        copies: list[Callable[[Scorer], Scorer]] = [self.views] if self.views != ALONE else []
+        copies += [partial(BestHeading, copies=self.headings)] if self.headings > 1 else []
+        return (*copies, *([partial(Earlier, apart=self.loops)] if self.loops is not None else []))
+
+    @property
+    def copies(self) -> int:
+        """Of each query that are described."""
+        return self.headings * len(self.views.shifts)
+
+    def copies_of(self, traverse: Traverse, layout: Layout) -> Traverse:
+        """All copies of queries, see `facing_north` and `Moved`."""
+        return self.views.of(facing_north(traverse, layout, self.headings))
 
     def centres(self, default: bool) -> bool:
         """Whether single queries and those of a drive are centred."""

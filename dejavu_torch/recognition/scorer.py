@@ -101,10 +101,9 @@ class Scorer(ABC):
         """How many numbers of a query are in memory, all its scores or what finds the `wanted` ones."""
         return self.layout.places
 
-    def heading_at(self, queries: Tensor, places: Tensor) -> Tensor | None:
-        """The headings in degrees by which queries have their scores at places, (B,), (B,k) -> (B,k); None
-        unless there are copies of them."""
-        return None
+    def told(self, queries: Tensor, places: Tensor) -> dict[str, Tensor]:
+        """What copies of queries tell of them at places, (B,), (B,k) -> (B,k), by the columns of `Match`."""
+        return {}
 
     def beside(self, uncentred: Scorer) -> Self:
         """Let it know the scores of its queries as they are; returns itself."""
@@ -250,8 +249,8 @@ class Wrapped(Scorer):
     def rows(self, queries: Tensor) -> Tensor:
         return self.changed(self.scorer.rows(self.asked(queries)), queries)
 
-    def heading_at(self, queries: Tensor, places: Tensor) -> Tensor | None:
-        return self.scorer.heading_at(self.asked(queries), places)
+    def told(self, queries: Tensor, places: Tensor) -> dict[str, Tensor]:
+        return self.scorer.told(self.asked(queries), places)
 
 
 class Reordered(Wrapped):
@@ -268,8 +267,8 @@ class Reordered(Wrapped):
     def changed(self, scores: Tensor, queries: Tensor) -> Tensor:
         return scores[:, self.place.to(scores.device)]
 
-    def heading_at(self, queries: Tensor, places: Tensor) -> Tensor | None:
-        return self.scorer.heading_at(queries, self.place.to(places.device)[places.clamp(min=0)])
+    def told(self, queries: Tensor, places: Tensor) -> dict[str, Tensor]:
+        return self.scorer.told(queries, self.place.to(places.device)[places.clamp(min=0)])
 
 
 class Earlier(Wrapped):
@@ -290,24 +289,80 @@ class Earlier(Wrapped):
 
 
 class BestOf(Wrapped):
-    """Each query is so many consecutive ones of another scorer, its evenly turned copies: a place has the
-    best score of them. What was scored last is kept until it is known which copy answers."""
+    """Each query is so many consecutive ones of another scorer, its copies: a place has the best score of
+    them.
 
-    def __init__(self, scorer: Scorer, copies: int) -> None:
+    Args:
+        penalties: added to the scores of each copy, (V,), +inf for one that never answers; none by default.
+            before: those of the first `first` queries.
+    """
+
+    def __init__(
+        self,
+        scorer: Scorer,
+        copies: int,
+        penalties: Tensor | None = None,
+        before: Tensor | None = None,
+        first: int = 0,
+    ) -> None:
         super().__init__(scorer)
-        self.copies, self.descriptors = copies, scorer.descriptors[::copies]
-        self.at_once = scorer.at_once // copies
-        self.most = max(1, scorer.most // copies)
-        self.last: tuple[Tensor, Tensor, Tensor | None] | None = None
+        self.copies, self.descriptors, self.first = copies, scorer.descriptors[::copies], first
+        after = torch.zeros(copies) if penalties is None else penalties
+        known = torch.stack([after, after if before is None else before])
+        self.kept = known.isfinite().any(0).nonzero()[:, 0]  # the copies that answer
+        self.penalties = known[:, self.kept]
+        self.at_once = scorer.at_once // len(self.kept)
+        self.most = max(1, scorer.most // len(self.kept))
 
     def asked(self, queries: Tensor) -> Tensor:
-        return (queries[:, None] * self.copies + torch.arange(self.copies)).flatten()
+        return (queries[:, None] * self.copies + self.kept).flatten()
 
     def held(self, wanted: Wanted) -> int:
         return self.scorer.held(wanted)
 
+    def mirrored(self, queries: Tensor, seed: int = 0, so_far: SoFar | None = None) -> Tensor:
+        if so_far is not None:
+            total, count = (one.repeat_interleave(len(self.kept), 0) for one in so_far)
+            so_far = total, count
+        return super().mirrored(queries, seed, so_far)
+
     def changed(self, scores: Tensor, queries: Tensor) -> Tensor:
-        return scores.view(-1, self.copies, scores.shape[1]).amin(1)
+        return self._each(scores, queries).amin(1)
+
+    def best(self, queries: Tensor, wanted: Wanted) -> Lowest:
+        scores, places = self.scorer.best(self.asked(queries), wanted)
+        if places is None:
+            return self.changed(scores, queries), None
+        # the best of all copies are among the best of each
+        return self._each(scores, queries).flatten(1), places.view(len(queries), -1)
+
+    def _each(self, scores: Tensor, queries: Tensor) -> Tensor:
+        """The scores of each copy of queries, with its penalty: (B x V,n) -> (B,V,n)."""
+        scores = scores.view(len(queries), len(self.kept), -1)
+        if not self.penalties.any():
+            return scores
+        own = self.penalties[(queries < self.first).long().cpu()]
+        return scores + own[..., None].to(scores)
+
+
+class Repeated(Wrapped):
+    """Scores of queries of which each stands for so many copies that nobody can tell apart."""
+
+    def __init__(self, scorer: Scorer, copies: int) -> None:
+        super().__init__(scorer)
+        self.times, self.descriptors = copies, scorer.descriptors.repeat_interleave(copies, 0)
+
+    def asked(self, queries: Tensor) -> Tensor:
+        return queries // self.times
+
+
+class BestHeading(BestOf):
+    """As `BestOf`, of evenly turned copies, with the heading of the one that answers. What was scored last is
+    kept until that is known."""
+
+    def __init__(self, scorer: Scorer, copies: int) -> None:
+        super().__init__(scorer, copies)
+        self.last: tuple[Tensor, Tensor, Tensor | None] | None = None
 
     def rows(self, queries: Tensor) -> Tensor:
         scores = self.scorer.rows(self.asked(queries))
@@ -319,12 +374,11 @@ class BestOf(Wrapped):
         self.last = queries, scores, places
         if places is None:
             return self.changed(scores, queries), None
-        # the best of all copies are among the best of each
         return scores.view(len(queries), -1), places.view(len(queries), -1)
 
-    def heading_at(self, queries: Tensor, places: Tensor) -> Tensor | None:
+    def told(self, queries: Tensor, places: Tensor) -> dict[str, Tensor]:
         turn = self._copy_at(queries, places).cpu() * (360 / self.copies)
-        return ((turn - self.layout.north) % 360).float()
+        return {"heading": ((turn - self.layout.north) % 360).float()}
 
     def _copy_at(self, queries: Tensor, places: Tensor) -> Tensor:
         """Which copy of each query answers at places, (B,), (B,k) -> (B,k)."""
