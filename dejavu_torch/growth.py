@@ -414,7 +414,8 @@ def merge(models: Sequence[DejaVu], names: Sequence[str]) -> DejaVu:
     frames = [model.map.table.frames for model in models]
     trained = first.trained if all(model.trained == first.trained for model in models) else None
     names = joined_names([model.frame_names for model in models], frames)
-    merged.state = ModelState(first.frame_shape, first.step, trained, names)
+    views = first.views if all(one.views == first.views for one in models) else None
+    merged.state = ModelState(first.frame_shape, first.step, trained, names, views=views)
     dropped = [
         *["thresholds"] * (len(thresholds) > 1),
         *["calibration"] * (calibration is None and any(model.calibration for model in models)),

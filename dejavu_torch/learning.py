@@ -13,6 +13,7 @@ from typing import NoReturn, cast
 import torch
 from torch import Tensor
 
+from dejavu_torch.data.moving import Moved
 from dejavu_torch.data.traverse import Part
 from dejavu_torch.data.turning import Turned
 from dejavu_torch.features.descriptor import Descriptor
@@ -38,16 +39,19 @@ from dejavu_torch.maps.spectrum import Transform
 from dejavu_torch.memory import concatenate, in_one_thread
 from dejavu_torch.motion.resampling import ResampledTraverse
 from dejavu_torch.places.layout import Layout
-from dejavu_torch.recognition.calibration import TOLERANCE, Calibration, calibrated
+from dejavu_torch.recognition.calibration import TOLERANCE, Calibration, calibrated, confidence
 from dejavu_torch.recognition.centring import learn_turned
+from dejavu_torch.recognition.scorer import OfMap
+from dejavu_torch.recognition.views import SHIFTS, best_pairs
 from dejavu_torch.text import progress_of
-from dejavu_torch.types import Facts, InputError, Traverse, expect
+from dejavu_torch.types import Facts, InputError, Match, Traverse, expect
 
 MAX_SEGMENT = 512  # consecutive queries in a calibration
 SEGMENT_SCORES = 2**22  # maximum, queries of a segment x places
 OWN = 300  # frames of the reference whose look-alikes are asked for
 CALIBRATION_SCORES = 2**30  # maximum, frames of a calibration x places
 SAVE_INTERVAL = 60  # seconds between two versions of a partial map
+MOVED, ELSEWHERE, HALF = 50, -0.6, 0.5  # images that are moved; confidence in a place, and share of them
 TURNED, TURNS = 4000, 4  # windows of an area that are turned, at most, and each of them
 
 
@@ -256,6 +260,21 @@ def turn_windows(place_map: SpectralMap, descriptor: Descriptor, traverse: Trave
     one, other = 360 * torch.rand(2, count, generator=torch.Generator().manual_seed(0))
     with in_one_thread():
         learn_turned(place_map, descriptor.all_of(Turned(Turned(windows, one), other)))
+
+
+def looks_along(place_map: PlaceMap, descriptor: Descriptor, traverse: Traverse) -> bool:
+    """Whether images that are moved sideways show other places of the route, as where a camera looks down and
+    drives to its side: most of those that are moved farthest surely look like places elsewhere."""
+    if place_map.layout.dimensions > 1 or place_map.fidelity is None:
+        return False
+    count, shifts = min(MOVED, len(traverse)), (max(SHIFTS), min(SHIFTS))
+    some = torch.linspace(0, len(traverse) - 1, count).round().long()
+    with in_one_thread():
+        rows = descriptor.all_of(Moved(Part(traverse, some), shifts))
+    index, score = (one.view(2 * count, -1) for one in best_pairs(OfMap(place_map, rows), 2, count))
+    far = place_map.layout.distance(index[:, 0], some.repeat_interleave(2)) > TOLERANCE
+    sure = confidence(Match(index, score, far)) > ELSEWHERE
+    return float((far & sure).double().mean()) > HALF
 
 
 @torch.no_grad()

@@ -22,7 +22,7 @@ from dejavu_torch.features.descriptor import Descriptor, own_size
 from dejavu_torch.features.extract import features_of
 from dejavu_torch.features.joined import Joined
 from dejavu_torch.features.preprocess import Preprocess
-from dejavu_torch.features.views import LabelledFrames
+from dejavu_torch.features.views import AugmentedFrames, LabelledFrames
 from dejavu_torch.features.whitening import Whitening
 from dejavu_torch.maps.place_map import Mapper, PlaceMap
 from dejavu_torch.maps.spectral import SpectralMapper
@@ -35,7 +35,7 @@ from dejavu_torch.places.layout import ROUTE, Layout
 from dejavu_torch.recognition.centring import PRIOR, centred, set_apart
 from dejavu_torch.recognition.coarse import searcher
 from dejavu_torch.recognition.localizer import SINGLE, Localizer, Matching, answer
-from dejavu_torch.recognition.querying import QUERYING, Querying
+from dejavu_torch.recognition.querying import QUERYING, Querying, Sequences
 from dejavu_torch.recognition.scorer import OfMap, Scorer
 from dejavu_torch.recognition.search import Scan, Search, Searcher, check_search
 from dejavu_torch.recognition.select import HIGHEST, PROBABLE, Acceptance, check_candidates
@@ -256,7 +256,8 @@ class DejaVu(nn.Module):
             if counts is not None:
                 learned.count_visits(learned.visit_counts + counts.to(learned.device))
             learning.count_drives(learned, second)
-        return self.replace_map(learned, _state_of(self, learned, traverse))
+        self.replace_map(learned, _state_of(self, learned, traverse))
+        return self if second is None else self.look_at(second.traverse)
 
     def learn_features(
         self,
@@ -277,7 +278,8 @@ class DejaVu(nn.Module):
         layout = layout.reaching(len(features)) if traverse is None else traverse.layout
         learned = learning.learn_descriptors(self.mapper, features, layout)
         learning.count_drives(learned, second)
-        return self.replace_map(learned, _state_of(self, learned, traverse))
+        self.replace_map(learned, _state_of(self, learned, traverse))
+        return self if second is None else self.look_at(second.traverse)
 
     def resample(
         self,
@@ -370,7 +372,7 @@ class DejaVu(nn.Module):
             route = self.at_map_size(as_traverse(reference), self.frame_shape or ())
         known = route, views, places, progress, reach
         self.calibration = learning.calibration_of(self.descriptor, self.map, *known)
-        return self
+        return self if views is None else self.look_at(views.traverse)
 
     def forward(self, queries: Tensor) -> Tensor:
         """Section III-B: scores of all places, differentiable (eq. 3, eq. 4)."""
@@ -548,32 +550,51 @@ class DejaVu(nn.Module):
             descriptors = centred(self.map, descriptors, len(descriptors) // count)
         yield answer(self.scorer(descriptors, matching), matching, progress)
 
+    def views_at_first(self, querying: Sequences, images: bool, learns: bool) -> Views:
+        """The views of queries before these have shown which are of use.
+
+        Args:
+            images: the queries are no ready features. learns: they will show it.
+
+        Raises:
+            InputError: shifts of ready features, of an area or on a template map, or out of range.
+        """
+        asked, known = querying.shifts, self.state.views
+        images = images and self.map.layout.dimensions == 1 and self.map.fidelity is not None
+        if not isinstance(asked, str):
+            expect(images, "images, on the spectral map of a route", f"shifts {asked}")
+            return Views.given(asked, learns)
+        if asked == "none" or not images or known == ALONE:
+            return ALONE
+        return replace((known or ALONE).among(), learns=learns)
+
     def looking(self, queries: Traverse, querying: Querying, ordered: bool, centre: bool = False) -> Querying:
-        """How queries are matched, with the views that are compared.
+        """How queries are matched, with the views that are compared; errors as of `views_at_first`.
 
         Args:
             queries: as they are, described as the map's frames. ordered: one drive. centre: see `localize`.
-
-        Raises:
-            InputError: views of ready features, of an area or on a template map, or shifts out of range.
         """
-        layout, asked, known = self.map.layout, querying.shifts, self.state.views
-        images = len(queries.frame_shape) == 3 and layout.dimensions == 1 and self.map.fidelity is not None
-        learns = ordered and len(queries) >= LEAST
-        if not isinstance(asked, str):
-            seen = f"shifts {asked} of {queries.name} on this map"
-            expect(images and querying.headings == 1, "images, on the spectral map of a route", seen)
-            return replace(querying, views=Views.given(asked, learns))
-        if asked == "none" or not images or querying.headings > 1 or known == ALONE:
-            return replace(querying, views=ALONE)
-        views = replace((known or ALONE).among(), learns=learns)
+        images, learns = len(queries.frame_shape) == 3, ordered and len(queries) >= LEAST
+        views = self.views_at_first(querying, images and querying.headings == 1, learns)
+        if views == ALONE or querying.measures or not isinstance(querying.shifts, str):
+            return replace(querying, views=views)
+        useful = len(views.known[0]) > 1
         if learns:
             first = Part(queries, range(min(FIRST, len(queries))))
             rows = self.descriptor.all_of(views.of(first))
             best = views(self.scorer(centred(self.map, rows, len(SHIFTS)) if centre else rows))
-            learns = isinstance(best, BestView) and best.kept.tolist() != [0]
-        useful = learns or len(views.known[0]) > 1
+            useful |= isinstance(best, BestView) and best.kept.tolist() != [0]
         return replace(querying, views=views if useful else ALONE)
+
+    def look_at(self, visit: Traverse | AugmentedFrames) -> DejaVu:
+        """Let single images be compared with the views that another visit, in order, shows to be of use."""
+        if isinstance(visit, Traverse) and self.state.views is None and len(visit) >= LEAST:
+            first = Part(visit, range(min(FIRST, len(visit))))
+            querying = self.looking(first, QUERYING, True, self.centres(len(first)))
+            if querying.views != ALONE:
+                rows = centred(self.map, self.descriptor.all_of(querying.views.of(first)), querying.copies)
+                self.state.views = querying.views.learned(self.scorer(rows))
+        return self
 
     def centres(self, queries: int) -> bool:
         """Whether so many consecutive queries are centred by default."""
@@ -713,8 +734,10 @@ def _state_of(model: DejaVu, place_map: PlaceMap, traverse: Traverse | None) -> 
     if len(positions):
         place_map.positions = positions.to(place_map.device)
         place_map.check()
+    along = len(shape) == 3 and learning.looks_along(place_map, model.descriptor, traverse)
     step = traverse.step if isinstance(traverse, ResampledTraverse) else None
-    return model_file.ModelState(shape, step, frame_names=[*source_of(traverse).names])
+    names = [*source_of(traverse).names]
+    return model_file.ModelState(shape, step, frame_names=names, views=ALONE if along else None)
 
 
 def require_map(model: DejaVu, purpose: str = "") -> None:

@@ -135,8 +135,11 @@ def refine(model: DejaVu, drive: Source, progress: bool = False) -> Refinement:
         >>> print(refine(model, torch.rand(40, 8)))
         0 of 40 frames placed; nothing is learned, the map stays as it was
     """
-    refined = refined_by(model, described(model, drive, "refine", progress)[1])
+    traverse, descriptors = described(model, drive, "refine", progress)
+    refined = refined_by(model, descriptors)
     refined.into(model)
+    if refined.told.accepted:
+        model.look_at(traverse)
     return refined.told
 
 
@@ -206,6 +209,7 @@ def calibrate_by(model: DejaVu, drive: Traverse, progress: bool = False) -> Labe
     if (places >= 0).any():
         scores = (model.map.scores(rows) for rows in descriptors.split(_at_once(model.map)))
         model.calibration = _calibration(model.map, in_its_light(model, descriptors), places, scores)
+        model.look_at(drive)
     placed = Placed(torch.zeros(len(places), dtype=torch.int64), {0: drive.name}, SURE, 1)
     return LabelledFrames(drive, places.cpu(), placed)
 

@@ -19,6 +19,7 @@ from dejavu_torch.data.files import as_number, read_rows
 from dejavu_torch.data.output import whole_file
 from dejavu_torch.places.frame_table import FrameTable
 from dejavu_torch.places.layout import ROUTE
+from dejavu_torch.recognition.views import degrees
 from dejavu_torch.text import printable
 from dejavu_torch.types import InputError, Match
 
@@ -55,6 +56,7 @@ def write_matches(
     place_names: Sequence[str] = (),
     ranks: int | None = None,
     pairs: Path | None = None,
+    fov: float | None = None,
 ) -> tuple[int, int]:
     """Write batches of matches as a csv; return the numbers of (queries, queries with an accepted match).
 
@@ -68,6 +70,7 @@ def write_matches(
         ranks: matches per query; None is one, without a column for the rank.
         pairs: another file, with a line `query_name place_name` for each reported place: the image pairs
             that hloc and COLMAP read.
+        fov: of the camera, in degrees, by which a shift is also told in degrees.
 
     Convention 11: query and place count frames of the sources; -1 if no place is reported.
     """
@@ -79,6 +82,7 @@ def write_matches(
     start = next(matches, None)
     present = {} if start is None else start.columns
     known = [name for name in TOLD if name in present]
+    known += ["shift_degrees"] * (fov is not None and "shift" in known)
     with ExitStack() as stack:
 
         def opened(path: Path) -> TextIO:
@@ -113,6 +117,7 @@ def write_matches(
                     "confidence": _number(margin),
                     "heading": _number(north),
                     "shift": _number(shift, 3),
+                    "shift_degrees": "" if fov is None else _number(degrees(shift, fov), 3),
                     "rank": order,
                     "route": printable(layout.names("")[on]) if on >= 0 else "",
                     "x": _number(x, 9),

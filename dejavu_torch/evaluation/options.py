@@ -22,7 +22,7 @@ from dejavu_torch.maps.template_map import TemplateMapper
 from dejavu_torch.model import DejaVu
 from dejavu_torch.motion.resampling import source_of
 from dejavu_torch.recognition.calibration import TOLERANCE
-from dejavu_torch.recognition.querying import Querying
+from dejavu_torch.recognition.querying import PYTHON, Querying
 from dejavu_torch.recognition.scorer import Scorer
 from dejavu_torch.types import InputError, Traverse, expect
 
@@ -31,7 +31,6 @@ log = logging.getLogger("dejavu_torch")
 NO_CALIBRATION = "none"
 REACH = "probabilities of being within %d places; here one is right within %d"
 UNREAD = (None, NO_CALIBRATION)  # values of --calibration that name no source
-PYTHON = {"option": False}  # metadata of a field that is no option of a command
 
 Reference = TypeVar("Reference", Traverse, Traverse | None)
 OtherModels = Mapping[str, tuple[str, DejaVu]]  # their names and models, by their keys in report.json

@@ -19,6 +19,8 @@ from dejavu_torch.memory import in_one_thread
 from dejavu_torch.model import DejaVu, check_queries
 from dejavu_torch.recognition.centring import running_mean, set_apart
 from dejavu_torch.recognition.filter import PlaceFilter
+from dejavu_torch.recognition.querying import Sequences
+from dejavu_torch.recognition.views import ALONE
 from dejavu_torch.types import InputError, Match, SequenceModel, check_shape, expect
 
 EXPECTED = "uint8 (H,W), (H,W,3) or (3,H,W), or float in [0, 1], or float (D,) for a map of ready features"
@@ -42,6 +44,7 @@ class LiveMatch(NamedTuple):
     route: str = ""  # of a merged map
     x: float = math.nan  # of the place in an area, pixels or metres as its coordinates
     y: float = math.nan
+    shift: float = math.nan  # of the camera, see `Match`
 
 
 class LiveLocalizer:
@@ -53,6 +56,8 @@ class LiveLocalizer:
         keep_scores: keep the scores of all places; otherwise single frames are searched as in `localize`.
         centre: remove the mean of the frames so far from each, see `RunningMean`.
         turned: the frames are turned north, on the map of an area; see `set_apart`.
+        shifts: see `Sequences`; views are learned from the first 100 frames, and answer after these.
+        measures: keep `LiveMatch.shift` known even if no moved view is of use.
 
     Shape: a frame (H,W), (H,W,3) or (C,H,W), tensor or array, uint8 or float in [0, 1] -> `LiveMatch`.
 
@@ -83,6 +88,8 @@ class LiveLocalizer:
         keep_scores: bool = True,
         centre: bool = False,
         turned: bool = False,
+        shifts: Literal["auto", "none"] | list[float] = "auto",
+        measures: bool = False,
     ) -> None:
         if model.step is not None and model.velocity is not None:
             seen = "the map's places are even steps along the ground, which only a whole traverse shows"
@@ -93,6 +100,8 @@ class LiveLocalizer:
         self.centring = running_mean(model.map) if centre and not turned else None
         self.model, self.sequence = model, PlaceFilter() if isinstance(sequence, str) else sequence
         self._shape: tuple[int, ...] | None = None  # of the latest valid frame
+        images = len(model.frame_shape or ()) == 3
+        self._views, self._measures = model.views_at_first(Sequences(shifts=shifts), images, True), measures
         whitening = model.whitening
         members = getattr(model.features, "members", [model.features])
         self._small = all(isinstance(one, SMALL) for one in members)
@@ -104,9 +113,10 @@ class LiveLocalizer:
         self.scores: Tensor | None = None
         place_map = self.model.map
         self._mean = torch.zeros(place_map.dimension + 1, device=place_map.device)  # of the frames so far
-        matching = self.model.matching(self.sequence)
+        matching, self._driven = self.model.matching(self.sequence), self._views.as_it_drives(self._measures)
         keep = self._keep if self.keep_scores else None
-        self._localizer = self.model.localizer(matching._replace(callback=keep))
+        wrappers = () if self._views == ALONE else (self._driven,)
+        self._localizer = self.model.localizer(matching._replace(callback=keep, wrappers=wrappers))
 
     def _keep(self, scores: Tensor) -> None:
         self.scores = scores[-1] if len(scores) else self.scores
@@ -129,7 +139,7 @@ class LiveLocalizer:
         if self.turned:
             descriptor = set_apart(self.model.map, descriptor)
         if self.centring is not None:
-            descriptor, mean = self.centring(descriptor, mean)
+            descriptor, mean = self.centring(descriptor, mean, len(descriptor))
         with in_one_thread(self.model.map.places):
             self._localizer.skip(min(left_out, MAX_SKIPPED))
             match = self._localizer(descriptor)
@@ -172,6 +182,7 @@ class LiveLocalizer:
             route=layout.names("")[int(layout.route_of(match.index))] if place >= 0 else "",
             x=x,
             y=y,
+            shift=math.nan if match.shift is None else float(match.shift),
         )
 
     @property
@@ -180,17 +191,22 @@ class LiveLocalizer:
         return self._localizer.posterior
 
     def _describe(self, batch: Tensor) -> Tensor:
-        """The descriptor (1,K) of a frame, which has to fit the map."""
-        whitening, dimension = self.model.whitening, self.model.map.dimension
-        batch = resize_like(batch, self.model.frame_shape)
-        with in_mode(self.model.descriptor, False):
-            features = features_of(batch, self.model.descriptor.describe, "the frame")
+        """The descriptors (V,K) of the views of a frame, which has to fit the map."""
+        whitening, dimension, shifts = self.model.whitening, self.model.map.dimension, self._driven.shifts
+        batch, own = resize_like(batch, self.model.frame_shape), self.model.descriptor
+
+        def views(frame: Tensor) -> Tensor:
+            return own.describe_moved(frame, shifts).flatten(1)
+
+        with in_mode(own, False):
+            features = features_of(batch, own.describe if len(shifts) == 1 else views, "the frame")
+        features = features.view(len(shifts), -1)
         if batch.shape[1:] != self._shape:
             check_queries(self.model, tuple(batch.shape[1:]), features.shape[1], "the frame")
             self._shape = batch.shape[1:]
         features = features.to(torch.promote_types(features.dtype, torch.float32))
         descriptor = features if whitening is None else whitening(features, self._projection)
-        check_shape(descriptor, f"1 {dimension}", "the frame gives features")
+        check_shape(descriptor, f"{len(shifts)} {dimension}", "the frame gives features")
         expect(descriptor.isfinite().all(), "finite numbers", "the frame gives NaN or infinite features")
         return descriptor
 

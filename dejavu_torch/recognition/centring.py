@@ -64,7 +64,7 @@ class RunningMean(nn.Module):
     """As `centred`, for consecutive batches: each query by the mean of those up to it.
 
     Shape: queries (B,K), the state (K+1,) before them -> (B,K), the next state: the sum of q - m, and the
-        number of queries. The first state is 0.
+        number of queries. The first state is 0. Of several `copies` of each query, the first counts.
     """
 
     mean: Tensor
@@ -74,11 +74,12 @@ class RunningMean(nn.Module):
         self.metric = place_map.metric
         self.register_buffer("mean", place_map.mean)
 
-    def forward(self, queries: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
-        mean = self.mean.to(queries)
-        shows = queries.any(1, keepdim=True).to(queries)
-        sums = state + (F.pad(queries - mean, (0, 1), value=1.0) * shows).cumsum(0)
-        return _without(self.metric, queries, sums[:, :-1] / (sums[:, -1:] + PRIOR)), sums[-1]
+    def forward(self, queries: Tensor, state: Tensor, copies: int = 1) -> tuple[Tensor, Tensor]:
+        mean, own = self.mean.to(queries), queries[::copies]
+        shows = own.any(1, keepdim=True).to(queries)
+        sums = state + (F.pad(own - mean, (0, 1), value=1.0) * shows).cumsum(0)
+        each = (sums[:, :-1] / (sums[:, -1:] + PRIOR)).repeat_interleave(copies, 0)
+        return _without(self.metric, queries, each), sums[-1]
 
 
 def running_mean(place_map: PlaceMap) -> RunningMean:

@@ -20,6 +20,7 @@ from dejavu_torch.recognition.views import ALONE, Views
 from dejavu_torch.text import refuse_with
 from dejavu_torch.types import InputError, SequenceModel, Traverse, expect
 
+PYTHON = {"option": False}  # metadata of a field that is no option of a command
 WAYS = "drive, filter, single or sequence:T with a whole number T of at least 1"
 
 
@@ -31,12 +32,16 @@ class Sequences:
         match: drive (each query with all others; default if in order), filter (with those before), sequence:T
             (T queries at constant speed) or single; scores of the first two are at least -log(probability)
         speeds: speeds of a sequence in places per query, such as '[.8,1,1.25]'; 1 if not given
+        shifts: sideways moves of each image, of which the best answers, for a camera that points elsewhere
+            than at learning: auto (those that the first 100 queries in order, or the map, show to be of use),
+            none, or a list in shares of the width
     """
 
     match: str | SequenceModel | None = None
     speeds: list[float] | None = None
     sequence: int | None = None  # also spelt --match sequence:T
     filter: bool = False  # also spelt --match filter
+    shifts: Literal["auto", "none"] | list[float] = "auto"
 
     @property
     def way(self) -> str | None:
@@ -99,10 +104,8 @@ class Querying(Sequences):
             before each frame, and all after it
         headings: tried per image on the map of an area, evenly over 360 degrees, such as 24, which takes 24
             times as long
-        shifts: views of each image, moved sideways, of which the best answers, for a camera that points a
-            little elsewhere than at learning: auto are those that the first 100 queries in order show to be
-            of use, or the map knows; none; or a list in shares of the width, such as '[-.1,.1]'
-        views: what `shifts` have come to, see `DejaVu.looking`.
+        views: what `shifts` have come to, see `DejaVu.looking`. measures: the shift of the camera is asked
+            for even if no moved view is of use.
     """
 
     ordered: bool = False
@@ -111,8 +114,8 @@ class Querying(Sequences):
     top: int | None = None
     loops: int | None = None
     headings: int = 1
-    shifts: Literal["auto", "none"] | list[float] = "auto"
-    views: Views = field(default=ALONE, metadata={"option": False})
+    views: Views = field(default=ALONE, metadata=PYTHON)
+    measures: bool = field(default=False, metadata=PYTHON)
 
     def order(self, matcher: SequenceModel | Literal["auto"] | None) -> bool | None:
         """Whether queries, matched so, are in order; None leaves it to their source."""

@@ -25,9 +25,11 @@ FIRST, LEAST = 100, 40  # queries that penalties are learned from; fewer do not 
 SURE, ROUNDS = 1 / 3, 4  # share of the answers that tell, the surest; times that they are asked
 START, NATS = 0.08, 0.04  # first penalty of a moved view, and for each nat by which it is rarer
 AS_IT_IS, OTHER = 2.0, 0.3  # answers by the unmoved view, and by each other, that are taken for granted
+STEADY = 3  # places between the answers of neighbouring queries; views are of use if more are as near
 CHANCE = 0.08  # share of the answers below which a view is left out; by chance each has one of thirteen
 MEASURED = 10  # queries whose mean score is the unit of penalties, about 1 for cosines
 FLAT = 0.02  # of this unit: scores that differ less over all views do not tell a shift
+WIDEST = 180  # degrees of a field of view
 MOST_PLACES = 2**17  # of a map on which shifts are measured
 
 
@@ -63,20 +65,24 @@ class Views:
 
     def __call__(self, scorer: Scorer) -> Scorer:
         """The scores of the best views; `scorer` has those of all."""
-        copies = len(self.shifts)
-        if copies == 1:
+        if len(self.shifts) == 1:
             return scorer
-        count = len(scorer) // copies
-        asked = torch.linspace(0, max(0, count - 1), min(count, MEASURED)).round().long()
-        unit = unit_of(scorer, copies * asked)
-        known = unit * torch.tensor(self.penalties)
-        if self.learns and count >= LEAST:
-            known = penalties_of(*best_pairs(scorer, copies, min(count, FIRST)), scorer, unit)
-        return BestView(scorer, self.shifts, unit, known)
+        unit, known = unit_of(scorer, len(self.shifts)), self.learned(scorer)
+        return BestView(scorer, self.shifts, unit, unit * torch.tensor(known.penalties))
 
-    def as_it_drives(self) -> Driven:
+    def learned(self, scorer: Scorer) -> Views:
+        """The same views with the penalties that the first queries tell, if they are enough."""
+        copies = len(self.shifts)
+        count = len(scorer) // copies
+        if not self.learns or count < LEAST:
+            return self
+        unit = unit_of(scorer, copies)
+        penalties = penalties_of(*best_pairs(scorer, copies, min(count, FIRST)), scorer, unit) / unit
+        return replace(self, penalties=tuple(penalties.tolist()), learns=False)
+
+    def as_it_drives(self, measures: bool = False) -> Driven:
         """The same, for consecutive queries, of which none knows those after it."""
-        return Driven(self)
+        return Driven(self, measures)
 
     def among(self, shifts: tuple[float, ...] = SHIFTS) -> Views:
         """The same views among others, which are left out."""
@@ -89,18 +95,18 @@ ALONE = Views()
 
 class Driven:
     """The best views of consecutive queries, batch by batch: penalties are learned from the first `FIRST` of
-    them, and hold for those after these."""
+    them, and hold for those after these. measures: even if no moved view is of use, they tell the shift."""
 
-    def __init__(self, views: Views) -> None:
-        self.views, self.seen, self.unit = views, 0, math.nan
+    def __init__(self, views: Views, measures: bool = False) -> None:
+        self.views, self.measures, self.seen, self.unit = views, measures, 0, math.nan
         self.learned: Tensor | None = None  # penalties (V,)
         self.pairs: list[tuple[Tensor, Tensor]] = []
 
     @property
     def shifts(self) -> tuple[float, ...]:
         """Of the copies of the next query: only the unmoved one, if no other is of use."""
-        alone = self.learned is not None and not bool(self.learned[1:].isfinite().any())
-        return ALONE.shifts if alone else self.views.shifts
+        useful = self.learned is None or bool(self.learned[1:].isfinite().any())
+        return self.views.shifts if useful or self.measures else ALONE.shifts
 
     def __call__(self, scorer: Scorer) -> Scorer:
         """The scores of the best views; `scorer` has those of all views of the next queries."""
@@ -109,7 +115,7 @@ class Driven:
         if copies == 1 or not count:
             return scorer
         if not self.seen:
-            self.unit = unit_of(scorer, torch.zeros(1, dtype=torch.int64))
+            self.unit = unit_of(scorer)
         before, left = self.unit * torch.tensor(self.views.penalties), FIRST - self.seen
         if self.views.learns and left > 0:
             self.pairs.append(best_pairs(scorer, copies, min(left, count)))
@@ -150,11 +156,23 @@ class BestView(BestOf):
         return {"shift": shift}
 
 
-def unit_of(scorer: Scorer, queries: Tensor) -> float:
-    """The mean finite score of some queries, (n,), the unit of penalties; 1 if there is none."""
-    scores = [block[block.isfinite()] for _, block in scorer.blocks(queries)]
-    count = sum(map(len, scores))
-    return sum(float(block.sum()) for block in scores) / count if count else 1.0
+def degrees(shift: float, fov: float) -> float:
+    """By how many degrees a camera points to the right, by its shift and its horizontal field of view."""
+    return math.degrees(math.atan(2 * shift * math.tan(math.radians(fov) / 2)))
+
+
+def check_fov(fov: float | None) -> None:
+    """Refuse a field of view that no flat picture has."""
+    expect(fov is None or 0 < fov < WIDEST, f"degrees above 0 and below {WIDEST}", fov=fov)
+
+
+def unit_of(scorer: Scorer, copies: int = 0) -> float:
+    """The mean finite score, of the first query or of some with so many copies; the unit of penalties."""
+    count = len(scorer) // max(1, copies)
+    some = torch.linspace(0, count - 1, min(count, MEASURED)).round().long() * copies
+    scores = [block[block.isfinite()] for _, block in scorer.blocks(some if copies else some[:1])]
+    known = sum(map(len, scores))
+    return sum(float(block.sum()) for block in scores) / known if known else 1.0
 
 
 def best_pairs(scorer: Scorer, copies: int, queries: int) -> tuple[Tensor, Tensor]:
@@ -186,7 +204,18 @@ def penalties_of(index: Tensor, score: Tensor, scorer: Scorer, unit: float) -> T
         answers[0] += AS_IT_IS - OTHER
         share = answers / answers.sum()
         penalties = NATS * unit * (share.max() / share).log()
-    return torch.where(share < CHANCE, math.inf, penalties).float()
+    penalties = torch.where(share < CHANCE, math.inf, penalties).float()
+    alone = torch.full((copies,), math.inf).index_fill(0, torch.tensor(0), 0.0)
+    steadier = _steady(index, score, penalties, scorer) > _steady(index, score, alone, scorer)
+    return penalties if steadier else alone
+
+
+def _steady(index: Tensor, score: Tensor, penalties: Tensor, scorer: Scorer) -> int:
+    """How many answers of views with these penalties are near those of the query before, see `best_pairs`."""
+    each = score.shape[1] // len(penalties)
+    best = (score + penalties.to(score).repeat_interleave(each)).argmin(1, keepdim=True)
+    place = index.gather(1, best)[:, 0].clamp(min=0)
+    return int((scorer.layout.distance(place[1:], place[:-1]) <= STEADY).sum())
 
 
 def shift_of(scores: Tensor, shifts: tuple[float, ...]) -> Tensor:
