@@ -9,7 +9,7 @@ import logging
 import math
 import os
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from importlib import import_module
 from pathlib import Path
@@ -19,13 +19,14 @@ import torch
 from torch import Tensor, nn
 
 from dejavu_torch.data.output import check_output_file, whole_file
-from dejavu_torch.features.extract import in_mode
+from dejavu_torch.features.extract import in_mode, moved_features
 from dejavu_torch.features.preprocess import Preprocess
 from dejavu_torch.maps.spectral_map import SpectralMap, scores_of
 from dejavu_torch.model import DejaVu, require_map
 from dejavu_torch.recognition.calibration import POWER
 from dejavu_torch.recognition.calibration import TOLERANCE as BEYOND
 from dejavu_torch.recognition.centring import running_mean
+from dejavu_torch.recognition.views import ALONE
 from dejavu_torch.text import one_line
 from dejavu_torch.types import Facts, InputError, SequenceModel, expect
 from dejavu_torch.version import __version__
@@ -87,21 +88,37 @@ class Resized(nn.Module):
         return nn.functional.interpolate(frames, self.size, mode="bilinear", antialias=True)
 
 
+class Seen(nn.Module):
+    """Features of all views of frames: (B,C,H,W) -> (B x V, D)."""
+
+    def __init__(self, features: nn.Module, shifts: Sequence[float]) -> None:
+        super().__init__()
+        self.features, self.shifts = features, shifts
+
+    def forward(self, frames: Tensor) -> Tensor:
+        return moved_features(self.features, frames, self.shifts).flatten(0, 1)
+
+
 class Graph(nn.Module):
-    """The exported form of a model: frames (B,C,H,W), or features (B,D), -> scores (B,N).
+    """The exported form of a model: frames (B,C,H,W), or features (B,D), -> scores (B,N), of the best views.
 
     With a sequence: one frame (1,C,H,W) and the state before it -> scores (1,N) and the next state. If it is
     `centred`, there is a further state, of the mean.
     """
 
+    penalties: Tensor
+
     def __init__(self, model: DejaVu, sequence: SequenceModel | None = None, centred: bool = False) -> None:
         super().__init__()
         parts: dict[str, nn.Module] = {}
-        shape = model.frame_shape or ()
+        shape, (shifts, penalties) = model.frame_shape or (), (model.views or ALONE).known
+        self.views = len(shifts)
+        self.register_buffer("penalties", torch.tensor(penalties)[:, None])
         if len(shape) == 3:
             parts |= {"size": Resized((shape[1], shape[2]))}
         if len(shape) != 1:
-            parts |= {"preprocess": model.preprocess, "features": model.features}
+            features = model.features if self.views == 1 else Seen(model.features, shifts)
+            parts |= {"preprocess": model.preprocess, "features": features}
         if model.whitening is not None and model.whitening.learned:
             whitening = copy.deepcopy(model.whitening)
             for part in whitening.parts:
@@ -119,11 +136,13 @@ class Graph(nn.Module):
             if isinstance(part, Preprocess) and part.blank > 0:
                 shows = part.shows(frames)[:, None]
             if name == "map" and shows is not None:
-                frames = frames * shows.to(frames)
+                frames = frames * shows.repeat_interleave(self.views, 0).to(frames)
             if name == "map" and self.centring is not None:
-                frames, mean = self.centring(frames, states[-1])
+                frames, mean = self.centring(frames, states[-1], self.views)
                 after.append(mean)
             frames = part(frames)
+        if self.views > 1:
+            frames = (frames.view(-1, self.views, frames.shape[1]) + self.penalties).amin(1)
         if self.sequence is not None:
             frames, state = self.sequence.step(frames, states[0])
             after.insert(0, state)
@@ -193,7 +212,7 @@ def export_onnx(
             free = {0: "batch"} if sequence is None else {}
             free |= {2: "height", 3: "width"} if noise.ndim == 4 else {}
             written = _serialised(_program(graph, inputs, names, free), facts)
-            exact = model if sequence is None and not centre else graph
+            exact = model if sequence is None and not centre and graph.views == 1 else graph
             difference = _difference(written, exact, noise, facts)
         except Exception as error:  # of any type, from torch, onnx or onnxruntime
             raise _refusal(graph, noise, error) from error
@@ -253,6 +272,9 @@ def _facts(model: DejaVu, sequence: SequenceModel | None, centre: bool) -> Facts
         facts["sequence"] = str(sequence)
         threshold = sequence.threshold_of(model.threshold)
         threshold = sequence.likely if threshold is None else threshold  # without a calibration
+    shifts, penalties = (model.views or ALONE).known
+    if len(shifts) > 1:
+        facts["views"] = dict(zip(map(str, shifts), penalties, strict=True))
     if centre:
         facts["inputs"]["mean"] = facts["outputs"]["next_mean"] = [model.map.dimension + 1]
     facts |= {} if threshold is None else {"threshold": threshold}

@@ -44,7 +44,7 @@ from dejavu_torch.recognition.centring import learn_turned
 from dejavu_torch.recognition.scorer import OfMap
 from dejavu_torch.recognition.views import SHIFTS, best_pairs
 from dejavu_torch.text import progress_of
-from dejavu_torch.types import Facts, InputError, Match, Traverse, expect
+from dejavu_torch.types import Facts, InputError, Traverse, expect
 
 MAX_SEGMENT = 512  # consecutive queries in a calibration
 SEGMENT_SCORES = 2**22  # maximum, queries of a segment x places
@@ -271,9 +271,9 @@ def looks_along(place_map: PlaceMap, descriptor: Descriptor, traverse: Traverse)
     some = torch.linspace(0, len(traverse) - 1, count).round().long()
     with in_one_thread():
         rows = descriptor.all_of(Moved(Part(traverse, some), shifts))
-    index, score = (one.view(2 * count, -1) for one in best_pairs(OfMap(place_map, rows), 2, count))
-    far = place_map.layout.distance(index[:, 0], some.repeat_interleave(2)) > TOLERANCE
-    sure = confidence(Match(index, score, far)) > ELSEWHERE
+    pairs = best_pairs(OfMap(place_map, rows), 2, count).map(lambda column: column.view(2 * count, -1))
+    far = place_map.layout.distance(pairs.index[:, 0], some.repeat_interleave(2)) > TOLERANCE
+    sure = confidence(pairs) > ELSEWHERE
     return float((far & sure).double().mean()) > HALF
 
 

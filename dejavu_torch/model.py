@@ -593,7 +593,7 @@ class DejaVu(nn.Module):
             querying = self.looking(first, QUERYING, True, self.centres(len(first)))
             if querying.views != ALONE:
                 rows = centred(self.map, self.descriptor.all_of(querying.views.of(first)), querying.copies)
-                self.state.views = querying.views.learned(self.scorer(rows))
+                self.state.views = Views(*querying.views.learned(self.scorer(rows)).known)
         return self
 
     def centres(self, queries: int) -> bool:

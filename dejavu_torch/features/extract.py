@@ -102,7 +102,8 @@ def moved_features(features: nn.Module, frames: Tensor, shifts: Sequence[float])
     frames = as_weights(frames, features)
     if (own := getattr(features, "moved", None)) is not None:
         return own(frames, shifts)  # type: ignore[no-any-return]
-    return features_of(moved(frames, shifts), features).view(len(frames), len(shifts), -1)
+    copies = features_of(moved(frames, shifts), features)
+    return copies.view(-1, len(shifts), copies.shape[1])
 
 
 def warn_of_bright(frames: Tensor, name: str) -> bool:

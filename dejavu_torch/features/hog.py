@@ -80,7 +80,7 @@ class HOG(nn.Module):
             cells = sideways(votes, at.flatten(), lambda seen: seen.flip(1))
             cells = F.avg_pool2d(cells, (1, parts)).unflatten(3, (len(shifts), nx))
             found = blocks_of(cells.permute(0, 3, 2, 4, 1).flatten(0, 1), self.block)
-            return found.view(len(some), len(shifts), -1)
+            return found.view(-1, len(shifts), found.shape[1])
 
         return in_parts(described, frames).to(frames.dtype)
 

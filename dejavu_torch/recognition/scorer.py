@@ -57,7 +57,7 @@ class Scorer(ABC):
         at_once: numbers that are computed together, of `most` queries. stored: the places that are stored
             themselves, (n,), if others have the scores of these. blank_finds: whether a blank query may find
             a place by itself. checks: whether a drive only lowers the probabilities of single queries.
-            copies: of each query, see `BestOf`.
+            copies: of each query, see `BestOf`. unit: about the mean score, the unit of penalties.
         uncentred: of the same queries as they are, for ways that do not know all of them; None if these are.
             It belongs to the outermost: wrappers do not pass it on.
     """
@@ -73,6 +73,7 @@ class Scorer(ABC):
     blank_finds: bool = True
     checks: bool = False
     copies: int = 1
+    unit: float = 1.0
     uncentred: Scorer | None = None
 
     def __len__(self) -> int:
@@ -131,6 +132,14 @@ class OfMap(Scorer):
         self.layout, self.links = place_map.layout, place_map.connections
         self.searcher = Scan(place_map) if searcher is None else searcher
         self.blank_finds = getattr(place_map, "metric", "") != "cosine"
+
+    @cached_property
+    def unit(self) -> float:  # type: ignore[override]
+        """1 for cosines; for distances that between two places at random, about twice that from the mean."""
+        if getattr(self.place_map, "metric", "") == "cosine":
+            return 1.0
+        scores = self.place_map.scores(self.place_map.mean[None])
+        return 2 * float(scores[scores.isfinite()].mean().nan_to_num(0.5))
 
     @cached_property
     def fidelity(self) -> float | None:
@@ -198,6 +207,11 @@ class OfStored(Scorer):
             self.frames = frames[self.stored.to(frames.device)]
             self.nearest = nearest.to(frames.device)
 
+    @cached_property
+    def unit(self) -> float:  # type: ignore[override]
+        scores = phase_distances(self.frames[:8], self.frames, self.metric)
+        return 1.0 if self.metric == "cosine" else float(scores.mean())
+
     def rows(self, queries: Tensor) -> Tensor:
         asked = self.descriptors[queries.to(self.descriptors.device)].to(self.frames.device)
         scores = phase_distances(asked, self.frames, self.metric)
@@ -237,6 +251,10 @@ class Wrapped(Scorer):
     @property
     def least(self) -> float:  # type: ignore[override]
         return self.scorer.least
+
+    @property
+    def unit(self) -> float:  # type: ignore[override]
+        return self.scorer.unit
 
     def changed(self, scores: Tensor, queries: Tensor) -> Tensor:
         """What becomes of the scores of queries (B,)."""
@@ -293,8 +311,8 @@ class BestOf(Wrapped):
     them.
 
     Args:
-        penalties: added to the scores of each copy, (V,), +inf for one that never answers; none by default.
-            before: those of the first `first` queries.
+        penalties: added to the scores of each copy in units of these, (V,), +inf for one that never answers;
+            none by default. before: those of the first `first` queries.
     """
 
     def __init__(
@@ -341,7 +359,7 @@ class BestOf(Wrapped):
         scores = scores.view(len(queries), len(self.kept), -1)
         if not self.penalties.any():
             return scores
-        own = self.penalties[(queries < self.first).long().cpu()]
+        own = self.unit * self.penalties[(queries < self.first).long().cpu()]
         return scores + own[..., None].to(scores)
 
 
