@@ -117,7 +117,7 @@ class Graph(nn.Module):
         if len(shape) == 3:
             parts |= {"size": Resized((shape[1], shape[2]))}
         if len(shape) != 1:
-            features = model.features if self.views == 1 else Seen(model.features, shifts)
+            features = model.features if shifts == ALONE.shifts else Seen(model.features, shifts)
             parts |= {"preprocess": model.preprocess, "features": features}
         if model.whitening is not None and model.whitening.learned:
             whitening = copy.deepcopy(model.whitening)
@@ -141,7 +141,7 @@ class Graph(nn.Module):
                 frames, mean = self.centring(frames, states[-1], self.views)
                 after.append(mean)
             frames = part(frames)
-        if self.views > 1:
+        if self.views > 1:  # by which one is chosen
             frames = (frames.view(-1, self.views, frames.shape[1]) + self.penalties).amin(1)
         if self.sequence is not None:
             frames, state = self.sequence.step(frames, states[0])
@@ -212,7 +212,7 @@ def export_onnx(
             free = {0: "batch"} if sequence is None else {}
             free |= {2: "height", 3: "width"} if noise.ndim == 4 else {}
             written = _serialised(_program(graph, inputs, names, free), facts)
-            exact = model if sequence is None and not centre and graph.views == 1 else graph
+            exact = model if sequence is None and not centre and "views" not in facts else graph
             difference = _difference(written, exact, noise, facts)
         except Exception as error:  # of any type, from torch, onnx or onnxruntime
             raise _refusal(graph, noise, error) from error
@@ -273,7 +273,7 @@ def _facts(model: DejaVu, sequence: SequenceModel | None, centre: bool) -> Facts
         threshold = sequence.threshold_of(model.threshold)
         threshold = sequence.likely if threshold is None else threshold  # without a calibration
     shifts, penalties = (model.views or ALONE).known
-    if len(shifts) > 1:
+    if shifts != ALONE.shifts:
         facts["views"] = dict(zip(map(str, shifts), penalties, strict=True))
     if centre:
         facts["inputs"]["mean"] = facts["outputs"]["next_mean"] = [model.map.dimension + 1]

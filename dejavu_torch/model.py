@@ -9,7 +9,7 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, TypeVar
+from typing import TYPE_CHECKING, Any, Literal, TypeVar, cast
 
 from torch import Tensor, nn
 from torch.nn.parameter import is_lazy
@@ -560,13 +560,13 @@ class DejaVu(nn.Module):
             InputError: shifts of ready features, of an area or on a template map, or out of range.
         """
         asked, known = querying.shifts, self.state.views
-        images = images and self.map.layout.dimensions == 1 and self.map.fidelity is not None
+        images = images and self.map.layout.ahead and self.map.fidelity is not None
         if not isinstance(asked, str):
             expect(images, "images, on the spectral map of a route", f"shifts {asked}")
-            return Views.given(asked, learns)
-        if asked == "none" or not images or known == ALONE:
+            return Views.given(asked, learns, querying.fov)
+        if asked == "none" or not (images and self.descriptor.moves) or known == ALONE:
             return ALONE
-        return replace((known or ALONE).among(), learns=learns)
+        return replace((known or ALONE).among(), learns=learns, fov=querying.fov)
 
     def looking(self, queries: Traverse, querying: Querying, ordered: bool, centre: bool = False) -> Querying:
         """How queries are matched, with the views that are compared; errors as of `views_at_first`.
@@ -576,9 +576,9 @@ class DejaVu(nn.Module):
         """
         images, learns = len(queries.frame_shape) == 3, ordered and len(queries) >= LEAST
         views = self.views_at_first(querying, images and querying.headings == 1, learns)
-        if views == ALONE or querying.measures or not isinstance(querying.shifts, str):
+        if views == ALONE or querying.fov is not None or not isinstance(querying.shifts, str):
             return replace(querying, views=views)
-        useful = len(views.known[0]) > 1
+        useful = views.known[0] != ALONE.shifts
         if learns:
             first = Part(queries, range(min(FIRST, len(queries))))
             rows = self.descriptor.all_of(views.of(first))
@@ -588,12 +588,13 @@ class DejaVu(nn.Module):
 
     def look_at(self, visit: Traverse | AugmentedFrames) -> DejaVu:
         """Let single images be compared with the views that another visit, in order, shows to be of use."""
-        if isinstance(visit, Traverse) and self.state.views is None and len(visit) >= LEAST:
-            first = Part(visit, range(min(FIRST, len(visit))))
+        drive = hasattr(visit, "layout") and self.views is None  # copies of frames lie nowhere
+        if drive and len(visit) >= LEAST:
+            first = Part(cast(Traverse, visit), range(min(FIRST, len(visit))))
             querying = self.looking(first, QUERYING, True, self.centres(len(first)))
             if querying.views != ALONE:
                 rows = centred(self.map, self.descriptor.all_of(querying.views.of(first)), querying.copies)
-                self.state.views = Views(*querying.views.learned(self.scorer(rows)).known)
+                self.views = Views(*querying.views.learned(self.scorer(rows)).known)
         return self
 
     def centres(self, queries: int) -> bool:
@@ -609,12 +610,11 @@ class DejaVu(nn.Module):
         search: Search | None = None,
         centre: bool | None = None,
         headings: int = 1,
-        shifts: Literal["auto", "none"] | Sequence[float] = "auto",
     ) -> Match:
         """The k best places of each query; the first is that of `localize`.
 
         Args:
-            queries, sequence, search, centre, headings, shifts: see `localize`.
+            queries, sequence, search, centre, headings: see `localize`.
             k: from 1 to the number of places.
             apart: suppression radius in places, at least 0: any two candidates of a query differ by more.
 
@@ -629,7 +629,7 @@ class DejaVu(nn.Module):
             >>> DejaVu().learn(wave).candidates(wave[20:22], k=3).index[:, 0]
             tensor([20, 21])
         """
-        querying = replace(_querying(sequence, centre, headings, shifts), top=k)
+        querying = replace(_querying(sequence, centre, headings), top=k)
         return Match.joined(self.matches(queries, querying, False, search, apart))
 
     def matching(self, sequence: SequenceModel | None = None, search: Search | None = None) -> Matching:
@@ -711,7 +711,7 @@ def _querying(
     sequence: SequenceModel | Literal["auto"] | None,
     centre: bool | None,
     headings: int,
-    shifts: Literal["auto", "none"] | Sequence[float],
+    shifts: Literal["auto", "none"] | Sequence[float] = "auto",
 ) -> Querying:
     """The options of `localize` as one object."""
     mean: Literal["mean", "none"] | None = None if centre is None else "mean" if centre else "none"

@@ -22,7 +22,10 @@ from dejavu_torch.model import DejaVu, check_queries, require_map
 from dejavu_torch.recognition.calibration import TOLERANCE, Calibration, calibrated_by_drive
 from dejavu_torch.recognition.centring import centred
 from dejavu_torch.recognition.evidence import spacing_of
+from dejavu_torch.recognition.localizer import answer
+from dejavu_torch.recognition.querying import QUERYING
 from dejavu_torch.recognition.smoother import PlaceSmoother
+from dejavu_torch.recognition.views import ALONE, BestView
 from dejavu_torch.types import InputError, Traverse, expect
 
 SURE = 0.9  # probability of a frame that teaches
@@ -48,6 +51,23 @@ def place_drive(model: DejaVu, descriptors: Tensor) -> Tensor:
     return torch.full_like(places, -1) if few or not match.is_drive else places
 
 
+@torch.no_grad()
+def straightened(model: DejaVu, drive: Traverse, progress: bool = False) -> Tensor:
+    """Descriptors (Q,K) of the frames of a drive, each of the view that looks as at learning, where the drive
+    as a whole finds it."""
+    count, centres = len(drive), model.centres(len(drive))
+    views = model.looking(drive, QUERYING, True, centres).views
+    rows = model.descriptor.all_of(views.of(drive), progress).float().to(model.map.device)
+    if views == ALONE:
+        return rows
+    best = views(model.scorer(centred(model.map, rows, len(rows) // count) if centres else rows))
+    match = answer(best, model.matching(PlaceSmoother()))
+    assert isinstance(best, BestView)
+    parts = torch.arange(count).split(max(1, best.at_once // model.map.places))
+    copy = torch.cat([best.copy_at(part, match.index[part, None])[:, 0].cpu() for part in parts])
+    return rows[(torch.arange(count) * best.copies + copy).to(rows.device)]
+
+
 def place_drives(
     model: DejaVu,
     reference: Traverse | None,
@@ -70,9 +90,10 @@ def place_drives(
         for rounds in range(1, most + 1):
             if reference is not None:
                 scratch.learn(reference, progress, views)
-            parts = scratch.descriptor.all_of(frames, progress).split(lengths)
-            pairs = zip(parts, drives, strict=True)
-            found = [place_drive(scratch, part) if known is None else known for part, (_, known) in pairs]
+            found = [
+                place_drive(scratch, straightened(scratch, drive, progress)).cpu() if known is None else known
+                for drive, known in drives
+            ]
             before, places = views, torch.cat(found)
             views = LabelledFrames(frames, places, Placed(which, names, SURE, rounds))
             if not (places >= 0).any() or (before is not None and torch.equal(before.places, places)):
@@ -154,7 +175,7 @@ def described(model: DejaVu, drive: Source, verb: str, progress: bool = False) -
     expect(len(traverse) >= SHORTEST, f"at least {SHORTEST}", f"{traverse.name} has {len(traverse)} frames")
     features = model.descriptor.count_features(traverse)
     check_queries(model, traverse.frame_shape, features, traverse.name)
-    return traverse, model.descriptor.all_of(traverse, progress).float().to(place_map.device)
+    return traverse, straightened(model, traverse, progress)
 
 
 class Refined(NamedTuple):
@@ -204,7 +225,7 @@ def refined_by(model: DejaVu, descriptors: Tensor) -> Refined:
 def calibrate_by(model: DejaVu, drive: Traverse, progress: bool = False) -> LabelledFrames:
     """Calibrate a map by all frames of a drive whose places nobody told, not only those that are placed; not
     if none is. Returns where they are."""
-    descriptors = model.descriptor.all_of(drive, progress).float().to(model.map.device)
+    descriptors = straightened(model, drive, progress)
     places = place_drive(model, descriptors)
     if (places >= 0).any():
         scores = (model.map.scores(rows) for rows in descriptors.split(_at_once(model.map)))

@@ -80,11 +80,12 @@ def compared(reference, query, truth):
     )
 
 
+# views of the first 100 queries, and of 50 places when they are learned, are searched and scored
 RUNS = {  # searched, scored, moved, described
-    "single": (localized(lambda: None), (150, 0, 0, 451)),
-    "filter": (localized(PlaceFilter), (0, 150, 150, 451)),
-    "drive": (localized(PlaceSmoother), (0, 1053, 1192, 451)),
-    "compare": (compared(*ROUTE, "0"), (150, 3004, 12678, 903)),
+    "single": (localized(lambda: None), (1450, 100, 0, 451)),
+    "filter": (localized(PlaceFilter), (1300, 250, 150, 451)),
+    "drive": (localized(PlaceSmoother), (1300, 1152, 1192, 451)),
+    "compare": (compared(*ROUTE, "0"), (1450, 3104, 12678, 903)),
     "compare of an area": (compared(*AREA, None), (58, 1576, 944, 765)),
 }
 

@@ -23,7 +23,7 @@ ARROWS = {
     "features": "places text types memory resize data",
     "periods": "text types memory",
     "maps": "places lazy types text memory data periods",
-    "recognition": "places text types memory maps",
+    "recognition": "places text types memory data maps",
     "motion": "places text types memory data",
     "learning": "places text types memory data features maps recognition motion",
     "model_file": "text version types memory data features periods maps recognition motion",

@@ -411,7 +411,6 @@ def write_matches(
     model: DejaVu,
     ranks: int | None = None,
     pairs: Path | None = None,
-    fov: float | None = None,
 ) -> tuple[int, int]:
     """Write the matches of a query; returns the numbers of queries and of accepted answers."""
     from dejavu_torch.evaluation import matches as files
@@ -420,4 +419,4 @@ def write_matches(
     if isinstance(query, ResampledTraverse):
         frames, source = query.frame, query.traverse
     names = source.names, model.frame_names
-    return files.write_matches(path, matches, frames, model.map.table, *names, ranks, pairs, fov)
+    return files.write_matches(path, matches, frames, model.map.table, *names, ranks, pairs)

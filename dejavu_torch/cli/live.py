@@ -10,7 +10,6 @@ import time
 from collections import deque
 from collections.abc import Iterable
 from contextlib import ExitStack, suppress
-from typing import Literal
 
 import numpy as np
 
@@ -23,7 +22,7 @@ from dejavu_torch.live.feed import FrameReader, in_real_time
 from dejavu_torch.live.localizer import LiveLocalizer, LiveMatch
 from dejavu_torch.live.page import Page, ReferencePictures, Snapshot, without_nan
 from dejavu_torch.model import DejaVu
-from dejavu_torch.recognition.views import degrees
+from dejavu_torch.recognition.querying import SEQUENCES, Sequences
 from dejavu_torch.text import printable
 from dejavu_torch.types import InputError, SequenceModel, expect
 
@@ -53,8 +52,7 @@ def follow(
     realtime: bool = False,
     timeout: float = 10.0,
     centre: bool = False,
-    shifts: Literal["auto", "none"] | list[float] = "auto",
-    fov: float | None = None,
+    looking: Sequences = SEQUENCES,
 ) -> None:
     """Localize the frames of a source until it ends or Ctrl-C; see `run_live`.
 
@@ -65,7 +63,7 @@ def follow(
         InputError: the source fails; the lines and the summary of earlier frames are printed first.
     """
     frames, newest, name, turned = frames_from(source, model, realtime, port is not None)
-    localizer = LiveLocalizer(model, sequence, port is not None, centre, turned, shifts, fov is not None)
+    localizer = LiveLocalizer(model, sequence, port is not None, centre, turned, looking)
     title += f"; answers come {localizer.lag} frames later and use these" if localizer.lag else ""
     recent: deque[float] = deque(maxlen=RECENT)  # milliseconds
     waiting: deque[Frame] = deque()  # for their answers
@@ -88,7 +86,7 @@ def follow(
                 frame = waiting.popleft()
                 recent.append(match.milliseconds)
                 count += 1
-                print(line_of(frame, match, fov))
+                print(line_of(frame, match))
             if matches and page is not None and localizer.scores is not None:
                 posterior = localizer.posterior
                 drawn = localizer.scores if posterior is None else posterior
@@ -161,15 +159,15 @@ def _with_warning(camera: Camera) -> Iterable[Frame]:
         yield frame
 
 
-def line_of(image: Frame, match: LiveMatch, fov: float | None = None) -> str:
+def line_of(image: Frame, match: LiveMatch) -> str:
     """An answer as a line of JSON."""
     answer = match._asdict() | {"milliseconds": round(match.milliseconds, 3)}
-    names = ("place", "frame", "route", "x", "y", "shift")
-    place, frame, route, x, y, shift = (answer.pop(name) for name in names)
+    names = ("place", "frame", "route", "x", "y", "shift", "shift_degrees")
+    place, frame, route, x, y, shift, turn = (answer.pop(name) for name in names)
     facts = {"frame": image.number, "time": image.seconds, "place": place, "reference_frame": frame, **answer}
     facts |= {} if math.isnan(x) else {"x": x, "y": y}
-    facts |= {} if math.isnan(shift) and fov is None else {"shift": round(shift, 4)}
-    facts |= {} if fov is None else {"shift_degrees": round(degrees(shift, fov), 2)}
+    facts |= {} if math.isnan(shift) else {"shift": round(shift, 4)}
+    facts |= {} if math.isnan(turn) else {"shift_degrees": round(turn, 2)}
     return json.dumps(without_nan(facts | ({"route": route} if route else {})))
 
 

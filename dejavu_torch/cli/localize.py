@@ -32,7 +32,6 @@ from dejavu_torch.recognition.calibration import TOLERANCE
 from dejavu_torch.recognition.querying import Querying
 from dejavu_torch.recognition.select import Acceptance, check_candidates
 from dejavu_torch.recognition.smoother import PlaceSmoother
-from dejavu_torch.recognition.views import check_fov
 from dejavu_torch.text import refuse_with
 from dejavu_torch.types import InputError, Match, Traverse, expect
 
@@ -48,11 +47,10 @@ def run_localize(
     route: str | None = None,
     pairs: Path | None = None,
     corners: list[list[float]] | None = None,
-    querying: Querying,
+    querying: options.LocalQuerying,
     searching: options.Searching,
     cluster: str | None = None,
     skip_damaged: bool = False,
-    fov: float | None = None,
     loading: options.Loading,
 ) -> None:
     """Find the frames of a source on a map.
@@ -67,10 +65,8 @@ def run_localize(
         corners: where this camera sees the patch of ground that the map's --velocity.corners describe
         cluster: divide the map among Ray workers, as in `dejavu learn`; for single queries only
         skip_damaged: go on if frames cannot be read; they find nothing
-        fov: horizontal field of view of the camera in degrees, by which shifts are also told in degrees
     """
     device_of(loading.device)
-    check_fov(fov)
     _check_written(out, pairs, map, source)
     querying.check_loops(cluster=cluster)
     matcher = querying.matcher(SUPPRESSION, acceptance.threshold)
@@ -94,7 +90,7 @@ def run_localize(
     if matcher == "auto":
         matcher = querying.matcher(SUPPRESSION, acceptance.threshold, ordered)
     assert not isinstance(matcher, str)
-    asked = replace(querying.by(matcher), ordered=ordered, measures=fov is not None)
+    asked = replace(querying.by(matcher), ordered=ordered)
     matches, chosen = _found(model, query, asked)
     counts, lost = Counter[str](), set[bool]()
 
@@ -110,7 +106,7 @@ def run_localize(
 
             workers = stack.enter_context(Cluster(cluster))
             model.searcher = ClusterSearch(workers, model.map, searching.search, searching.bytes)
-        total, accepted = write_matches(out, counted(), query, model, querying.top, pairs, fov)
+        total, accepted = write_matches(out, counted(), query, model, querying.top, pairs)
     if not model.map.summary().covered:
         print("the map has no layers, so no place can be reported")
     elif not chosen.given:
@@ -202,7 +198,6 @@ def run_live(
     route: str | None = None,
     realtime: bool = False,
     timeout: float = 10.0,
-    fov: float | None = None,
     loading: options.Loading,
 ) -> None:
     """Localize frames as they arrive: print a line of JSON for each, and a summary on stderr at the end.
@@ -220,14 +215,12 @@ def run_live(
         route: find places of this route of a merged map alone
         realtime: play a video in real time, and drop frames that arrive too fast
         timeout: seconds without a frame after which a camera, address or pipe has stalled
-        fov: horizontal field of view of the camera in degrees, by which shifts are also told in degrees
     """
     from dejavu_torch.cli.live import follow
     from dejavu_torch.data.camera import without_password
 
     device_of(loading.device)
     expect(reference is None or page is not None, "both", f"--reference {reference} without --page")
-    check_fov(fov)
     expect(0 < timeout <= threading.TIMEOUT_MAX, "seconds, above 0", f"--timeout {timeout:g}")
     matcher = sequences.matcher(SUPPRESSION, acceptance.threshold)
     assert not isinstance(matcher, str)  # the default is the filter
@@ -237,5 +230,5 @@ def run_live(
     acceptance.of(model)
     model.matching(matcher)
     title, centre = f"{without_password(source)} on {map}", sequences.centre == "mean"
-    settings = centre, sequences.shifts, fov
+    settings = centre, sequences
     follow(model, matcher, source, title, page, reference, realtime, timeout, *settings)

@@ -28,7 +28,7 @@ from dejavu_torch.model import DejaVu, check_precision
 from dejavu_torch.model_file import NO_MAP, recipe_of
 from dejavu_torch.recognition.coarse import searcher
 from dejavu_torch.recognition.filter import PlaceFilter
-from dejavu_torch.recognition.querying import Sequences
+from dejavu_torch.recognition.querying import Querying, Sequences
 from dejavu_torch.recognition.search import Search, check_search
 from dejavu_torch.text import refuse_with
 from dejavu_torch.types import InputError, SequenceModel, Traverse, expect
@@ -44,11 +44,14 @@ class LiveSequences(Sequences):
         lag: delay the filter's answers by this many frames, and use these frames for them
         learns: let the filter learn the camera's moves and the sharpness of scores from the drive
         centre: mean subtracts the mean of the frames so far from each frame
+        fov: horizontal field of view of the camera in degrees: tell by how many of them it points further
+            right than at learning
     """
 
     lag: int = 0
     learns: bool = False
     centre: Literal["mean", "none"] = "none"
+    fov: float | None = None
 
     @property
     def way(self) -> str | None:
@@ -63,6 +66,18 @@ class LiveSequences(Sequences):
         seen = f"--lag {self.lag}" if self.lag else "--learns"
         expect(not self.lag and not self.learns, "--match filter with it", f"{seen} with --match {self.way}")
         return matcher
+
+
+@dataclass(frozen=True)
+class LocalQuerying(Querying):
+    """How queries are matched.
+
+    Args:
+        fov: horizontal field of view of the camera in degrees: tell by how many of them it points further
+            right than at learning
+    """
+
+    fov: float | None = None
 
 
 @dataclass(frozen=True)

@@ -19,13 +19,12 @@ from dejavu_torch.data.files import as_number, read_rows
 from dejavu_torch.data.output import whole_file
 from dejavu_torch.places.frame_table import FrameTable
 from dejavu_torch.places.layout import ROUTE
-from dejavu_torch.recognition.views import degrees
 from dejavu_torch.text import printable
 from dejavu_torch.types import InputError, Match
 
 log = logging.getLogger("dejavu_torch")
 
-TOLD = "probability", "confidence", "heading", "shift"  # if they are known
+TOLD = "probability", "confidence", "heading", "shift", "shift_degrees"  # if they are known
 NUMBERS, NAMES = ("query", "place", "score", "accepted"), ("query_name", "place_name")
 EXPECTED = "columns query,place,score and optionally accepted, probability, confidence, rank, route"
 ELSEWHERE = -2  # the place of an answer on another route
@@ -56,7 +55,6 @@ def write_matches(
     place_names: Sequence[str] = (),
     ranks: int | None = None,
     pairs: Path | None = None,
-    fov: float | None = None,
 ) -> tuple[int, int]:
     """Write batches of matches as a csv; return the numbers of (queries, queries with an accepted match).
 
@@ -70,7 +68,6 @@ def write_matches(
         ranks: matches per query; None is one, without a column for the rank.
         pairs: another file, with a line `query_name place_name` for each reported place: the image pairs
             that hloc and COLMAP read.
-        fov: of the camera, in degrees, by which a shift is also told in degrees.
 
     Convention 11: query and place count frames of the sources; -1 if no place is reported.
     """
@@ -82,7 +79,6 @@ def write_matches(
     start = next(matches, None)
     present = {} if start is None else start.columns
     known = [name for name in TOLD if name in present]
-    known += ["shift_degrees"] * (fov is not None and "shift" in known)
     with ExitStack() as stack:
 
         def opened(path: Path) -> TextIO:
@@ -100,11 +96,20 @@ def write_matches(
             queries = torch.arange(first, total) if query_frames is None else query_frames[first:total]
             places, own = table.frame_of(match.index), table.own_frame_of(match.index)
             rank = torch.arange(each).repeat(len(queries)) + 1
-            right, sure, turn, aside = (match.columns.get(name, match.score) for name in TOLD)
+            right, sure, turn, aside, by = (match.columns.get(name, match.score) for name in TOLD)
             route, at = layout.route_of(match.index), layout.coordinates(match.index)
             whole = queries.repeat_interleave(each), places, own, match.accepted, rank, route
-            parts = match.score, right, sure, turn, aside, *at.unbind(1)
-            for (query, place, number, good, order, on), (score, chance, margin, north, shift, x, y) in zip(
+            parts = match.score, right, sure, turn, aside, by, *at.unbind(1)
+            for (query, place, number, good, order, on), (
+                score,
+                chance,
+                margin,
+                north,
+                shift,
+                by,
+                x,
+                y,
+            ) in zip(
                 *(zip(*(column.tolist() for column in columns), strict=True) for columns in (whole, parts)),
                 strict=True,
             ):
@@ -117,7 +122,7 @@ def write_matches(
                     "confidence": _number(margin),
                     "heading": _number(north),
                     "shift": _number(shift, 3),
-                    "shift_degrees": "" if fov is None else _number(degrees(shift, fov), 3),
+                    "shift_degrees": _number(by, 3),
                     "rank": order,
                     "route": printable(layout.names("")[on]) if on >= 0 else "",
                     "x": _number(x, 9),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from typing import cast
 
 import torch
 from torch import Tensor, nn
@@ -19,6 +20,7 @@ from dejavu_torch.features.extract import (
     features_of,
     in_mode,
     moved_features,
+    moves,
     warn_of_bright,
     warn_of_raw,
 )
@@ -135,8 +137,9 @@ class Descriptor(nn.Module):
         height, width = own_size(self.features) or (1, 1)
         size = max(1, min(self.batch_size, BATCH_NUMBERS // (3 * height * width)))
         settings = self.device, progress, verb, on_first, self.describe
-        if isinstance(traverse, Moved):
-            return self._moved(traverse, size, progress, verb, on_first)
+        if shifts := getattr(traverse, "shifts", ()):
+            source = cast(Moved, traverse).traverse
+            return self._moved(source, shifts, size, progress, verb, on_first)
         windows = Windows.of(traverse) if shared else None
         if windows is not None and self.sharing.fits(windows.grid):
             return self._shared(windows, traverse, size, progress, verb, on_first)
@@ -150,21 +153,32 @@ class Descriptor(nn.Module):
         return (part.to(self.device) for part in self.known[key][1].split(ROWS))
 
     def _moved(
-        self, traverse: Moved, size: int, progress: bool, verb: str, on_first: OnFirst | None
+        self,
+        traverse: Traverse,
+        shifts: Sequence[float],
+        size: int,
+        progress: bool,
+        verb: str,
+        on_first: OnFirst | None,
     ) -> Iterator[Tensor]:
-        """Features of the copies of each frame, which share what can be computed once."""
-        count = len(traverse.shifts)
+        """Features of copies of each frame, see `Moved`, which share what can be computed once."""
+        count = len(shifts)
 
         def describe(frames: Tensor) -> Tensor:
-            return self.describe_moved(frames, traverse.shifts).flatten(1)
+            return self.describe_moved(frames, shifts).flatten(1)
 
         def first(frames: Tensor, features: Tensor) -> None:
             if on_first is not None:
                 on_first(frames, features[:, : features.shape[1] // count])
 
         settings = self.device, progress, verb, first, describe
-        for batch in feature_batches(traverse.traverse, self, size, *settings):
+        for batch in feature_batches(traverse, self, size, *settings):
             yield batch.unflatten(1, (count, -1)).flatten(0, 1)
+
+    @property
+    def moves(self) -> bool:
+        """Whether views of a frame share most of what is computed, so that they cost little."""
+        return moves(self.features)
 
     @property
     def sharing(self) -> Sharing:

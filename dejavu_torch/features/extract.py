@@ -96,14 +96,18 @@ def features_of(batch: Tensor, describe: Callable[[Tensor], Tensor], name: str =
     return features
 
 
+def moves(features: nn.Module) -> bool:
+    """Whether features of moved frames are known without computing all of them again."""
+    return all(hasattr(member, "moved") for member in getattr(features, "members", [features]))
+
+
 def moved_features(features: nn.Module, frames: Tensor, shifts: Sequence[float]) -> Tensor:
     """Features of frames moved sideways, see `Moved`, by the module's method `moved` if it has one, else of
     moved frames: (B,C,H,W) -> (B,V,D)."""
     frames = as_weights(frames, features)
     if (own := getattr(features, "moved", None)) is not None:
         return own(frames, shifts)  # type: ignore[no-any-return]
-    copies = features_of(moved(frames, shifts), features)
-    return copies.view(-1, len(shifts), copies.shape[1])
+    return torch.stack([features_of(moved(frames, [shift]), features) for shift in shifts], 1)
 
 
 def warn_of_bright(frames: Tensor, name: str) -> bool:

@@ -19,7 +19,7 @@ from dejavu_torch.memory import in_one_thread
 from dejavu_torch.model import DejaVu, check_queries
 from dejavu_torch.recognition.centring import running_mean, set_apart
 from dejavu_torch.recognition.filter import PlaceFilter
-from dejavu_torch.recognition.querying import Sequences
+from dejavu_torch.recognition.querying import SEQUENCES, Sequences
 from dejavu_torch.recognition.views import ALONE
 from dejavu_torch.types import InputError, Match, SequenceModel, check_shape, expect
 
@@ -45,6 +45,7 @@ class LiveMatch(NamedTuple):
     x: float = math.nan  # of the place in an area, pixels or metres as its coordinates
     y: float = math.nan
     shift: float = math.nan  # of the camera, see `Match`
+    shift_degrees: float = math.nan
 
 
 class LiveLocalizer:
@@ -56,8 +57,7 @@ class LiveLocalizer:
         keep_scores: keep the scores of all places; otherwise single frames are searched as in `localize`.
         centre: remove the mean of the frames so far from each, see `RunningMean`.
         turned: the frames are turned north, on the map of an area; see `set_apart`.
-        shifts: see `Sequences`; views are learned from the first 100 frames, and answer after these.
-        measures: keep `LiveMatch.shift` known even if no moved view is of use.
+        looking: its shifts and fov; views are learned from the first 100 frames, and answer after these.
 
     Shape: a frame (H,W), (H,W,3) or (C,H,W), tensor or array, uint8 or float in [0, 1] -> `LiveMatch`.
 
@@ -88,8 +88,7 @@ class LiveLocalizer:
         keep_scores: bool = True,
         centre: bool = False,
         turned: bool = False,
-        shifts: Literal["auto", "none"] | list[float] = "auto",
-        measures: bool = False,
+        looking: Sequences = SEQUENCES,
     ) -> None:
         if model.step is not None and model.velocity is not None:
             seen = "the map's places are even steps along the ground, which only a whole traverse shows"
@@ -101,7 +100,7 @@ class LiveLocalizer:
         self.model, self.sequence = model, PlaceFilter() if isinstance(sequence, str) else sequence
         self._shape: tuple[int, ...] | None = None  # of the latest valid frame
         images = len(model.frame_shape or ()) == 3
-        self._views, self._measures = model.views_at_first(Sequences(shifts=shifts), images, True), measures
+        self._views = model.views_at_first(looking, images, True)
         whitening = model.whitening
         members = getattr(model.features, "members", [model.features])
         self._small = all(isinstance(one, SMALL) for one in members)
@@ -113,7 +112,7 @@ class LiveLocalizer:
         self.scores: Tensor | None = None
         place_map = self.model.map
         self._mean = torch.zeros(place_map.dimension + 1, device=place_map.device)  # of the frames so far
-        matching, self._driven = self.model.matching(self.sequence), self._views.as_it_drives(self._measures)
+        matching, self._driven = self.model.matching(self.sequence), self._views.as_it_drives()
         keep = self._keep if self.keep_scores else None
         wrappers = () if self._views == ALONE else (self._driven,)
         self._localizer = self.model.localizer(matching._replace(callback=keep, wrappers=wrappers))
@@ -183,6 +182,7 @@ class LiveLocalizer:
             x=x,
             y=y,
             shift=math.nan if match.shift is None else float(match.shift),
+            shift_degrees=math.nan if match.shift_degrees is None else float(match.shift_degrees),
         )
 
     @property

@@ -158,6 +158,11 @@ class Layout:
     # ------------------------------------------------------------------ what there is
 
     @property
+    def ahead(self) -> bool:
+        """Whether a camera looks along a way, to the left or right of which it may point."""
+        return self.dimensions == 1
+
+    @property
     def area(self) -> Layout | None:
         """Itself, if it is that of an area; None along routes."""
         return self if self.dimensions == 2 else None

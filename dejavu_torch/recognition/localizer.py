@@ -292,7 +292,9 @@ def told(match: Match, scorer: Scorer, queries: Tensor) -> Match:
     columns = scorer.told(queries, match.index.view(len(queries), -1 if len(queries) else 1))
     shape, lost = match.index.shape, match.index < 0
     known = {name: one.view(shape).masked_fill(lost, torch.nan) for name, one in columns.items()}
-    return replace(match, heading=known.get("heading"), shift=known.get("shift"))
+    names = ("heading", "shift", "shift_degrees")
+    heading, shift, turn = (known.get(name) for name in names)
+    return replace(match, heading=heading, shift=shift, shift_degrees=turn)
 
 
 def wrapped(scorer: Scorer, matching: Matching) -> Scorer:

@@ -32,9 +32,9 @@ class Sequences:
         match: drive (each query with all others; default if in order), filter (with those before), sequence:T
             (T queries at constant speed) or single; scores of the first two are at least -log(probability)
         speeds: speeds of a sequence in places per query, such as '[.8,1,1.25]'; 1 if not given
-        shifts: sideways moves of each image, of which the best answers, for a camera that points elsewhere
-            than at learning: auto (those that the first 100 queries in order, or the map, show to be of use),
-            none, or a list in shares of the width
+        shifts: views of images, for a camera that points to the side of where it did: auto (of use for the
+            first 100 in order, or known to the map), none, or a list in shares of the width
+        fov: horizontal field of view in degrees, for `Match.shift_degrees`
     """
 
     match: str | SequenceModel | None = None
@@ -42,6 +42,7 @@ class Sequences:
     sequence: int | None = None  # also spelt --match sequence:T
     filter: bool = False  # also spelt --match filter
     shifts: Literal["auto", "none"] | list[float] = "auto"
+    fov: float | None = field(default=None, metadata=PYTHON)
 
     @property
     def way(self) -> str | None:
@@ -104,8 +105,7 @@ class Querying(Sequences):
             before each frame, and all after it
         headings: tried per image on the map of an area, evenly over 360 degrees, such as 24, which takes 24
             times as long
-        views: what `shifts` have come to, see `DejaVu.looking`. measures: the shift of the camera is asked
-            for even if no moved view is of use.
+        views: what `shifts` have come to, see `DejaVu.looking`.
     """
 
     ordered: bool = False
@@ -115,7 +115,6 @@ class Querying(Sequences):
     loops: int | None = None
     headings: int = 1
     views: Views = field(default=ALONE, metadata=PYTHON)
-    measures: bool = field(default=False, metadata=PYTHON)
 
     def order(self, matcher: SequenceModel | Literal["auto"] | None) -> bool | None:
         """Whether queries, matched so, are in order; None leaves it to their source."""
@@ -160,4 +159,5 @@ class Querying(Sequences):
             refuse_with(f"--loops {self.loops}", match=together, **own, **others)
 
 
+SEQUENCES = Sequences()
 QUERYING = Querying()  # by the whole drive if queries are in order, else each by itself

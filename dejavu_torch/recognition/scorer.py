@@ -354,9 +354,15 @@ class BestOf(Wrapped):
         # the best of all copies are among the best of each
         return self._each(scores, queries).flatten(1), places.view(len(queries), -1)
 
+    def copy_at(self, queries: Tensor, places: Tensor) -> Tensor:
+        """Which copy of each query answers at places, (B,), (B,k) -> (B,k)."""
+        scores = self._each(self.scorer.rows(self.asked(queries)), queries)
+        at = places.clamp(min=0)[:, None].expand(-1, len(self.kept), -1).to(scores.device)
+        return self.kept[scores.gather(2, at).argmin(1).cpu()]
+
     def _each(self, scores: Tensor, queries: Tensor) -> Tensor:
         """The scores of each copy of queries, with its penalty: (B x V,n) -> (B,V,n)."""
-        scores = scores.view(len(queries), len(self.kept), -1)
+        scores = scores.view(len(queries), len(self.kept), scores.shape[1])
         if not self.penalties.any():
             return scores
         own = self.unit * self.penalties[(queries < self.first).long().cpu()]
@@ -395,16 +401,13 @@ class BestHeading(BestOf):
         return scores.view(len(queries), -1), places.view(len(queries), -1)
 
     def told(self, queries: Tensor, places: Tensor) -> dict[str, Tensor]:
-        turn = self._copy_at(queries, places).cpu() * (360 / self.copies)
+        turn = self.copy_at(queries, places).cpu() * (360 / self.copies)
         return {"heading": ((turn - self.layout.north) % 360).float()}
 
-    def _copy_at(self, queries: Tensor, places: Tensor) -> Tensor:
-        """Which copy of each query answers at places, (B,), (B,k) -> (B,k)."""
-        known: Tensor | None = None
-        if self.last is not None and self.last[0] is queries:
-            _, scores, known = self.last
-        else:
-            scores = self.scorer.rows(self.asked(queries))
+    def copy_at(self, queries: Tensor, places: Tensor) -> Tensor:
+        if self.last is None or self.last[0] is not queries:
+            return super().copy_at(queries, places)
+        _, scores, known = self.last
         if known is None:
             at = places.clamp(min=0)[:, None].expand(-1, self.copies, -1).to(scores.device)
             return scores.view(-1, self.copies, self.layout.places).gather(2, at).argmin(1)

@@ -39,18 +39,24 @@ class Views:
 
     shifts: see `Moved`. penalties: of each, see `BestOf`; +inf for a view that is left out.
     learns: whether those of queries in order are learned from these, and given ones hold until then.
+    fov: horizontal field of view in degrees; if it is known, shifts are told even if no moved view is of use.
     """
 
     shifts: tuple[float, ...] = (0.0,)
     penalties: tuple[float, ...] = (0.0,)
     learns: bool = False
+    fov: float | None = None
+
+    def __post_init__(self) -> None:
+        fits = self.fov is None or 0 < self.fov < WIDEST
+        expect(fits, f"degrees above 0 and below {WIDEST}", fov=self.fov)
 
     @classmethod
-    def given(cls, shifts: Sequence[float], learns: bool = False) -> Views:
+    def given(cls, shifts: Sequence[float], learns: bool = False, fov: float | None = None) -> Views:
         """The unmoved view and others, which a user has chosen."""
         moved = [float(one) for one in shifts if one]
         expect(moved and max(map(abs, moved)) <= MOST, f"some up to {MOST} of the width", f"shifts {shifts}")
-        return cls((0.0, *moved), (0.0, *[START] * len(moved)), learns)
+        return cls((0.0, *moved), (0.0, *[START] * len(moved)), learns, fov)
 
     @property
     def known(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
@@ -61,11 +67,11 @@ class Views:
 
     def of(self, traverse: Traverse) -> Traverse:
         """The copies of each frame."""
-        return traverse if len(self.shifts) == 1 else Moved(traverse, self.shifts)
+        return traverse if self.shifts == ALONE.shifts else Moved(traverse, self.shifts)
 
     def __call__(self, scorer: Scorer) -> Scorer:
         """The scores of the best views; `scorer` has those of all."""
-        return scorer if len(self.shifts) == 1 else BestView(scorer, self.learned(scorer))
+        return scorer if self.shifts == ALONE.shifts else BestView(scorer, self.learned(scorer))
 
     def learned(self, scorer: Scorer) -> Views:
         """The same views with the penalties that the first queries tell, if they are enough."""
@@ -78,9 +84,9 @@ class Views:
         """The same views with the penalties that the `best_pairs` of queries tell."""
         return replace(self, penalties=tuple(penalties_of(pairs, layout).tolist()), learns=False)
 
-    def as_it_drives(self, measures: bool = False) -> Driven:
+    def as_it_drives(self) -> Driven:
         """The same, for consecutive queries, of which none knows those after it."""
-        return Driven(self, measures)
+        return Driven(self)
 
     def among(self, shifts: tuple[float, ...] = SHIFTS) -> Views:
         """The same views among others, which are left out."""
@@ -93,16 +99,16 @@ ALONE = Views()
 
 class Driven:
     """The best views of consecutive queries, batch by batch: penalties are learned from the first `FIRST` of
-    them, and hold for those after these. measures: even if no moved view is of use, they tell the shift."""
+    them, and hold for those after these."""
 
-    def __init__(self, views: Views, measures: bool = False) -> None:
-        self.views, self.before, self.measures, self.seen = views, views, measures, 0
+    def __init__(self, views: Views) -> None:
+        self.views, self.before, self.seen = views, views, 0
         self.pairs: list[Match] = []
 
     @property
     def shifts(self) -> tuple[float, ...]:
         """Of the copies of the next query: only the unmoved one, if no other is of use."""
-        used = self.views.learns or self.measures or self.views.known[0] != ALONE.shifts
+        used = self.views.learns or self.views.fov is not None or self.views.known[0] != ALONE.shifts
         return self.views.shifts if used else ALONE.shifts
 
     def __call__(self, scorer: Scorer) -> Scorer:
@@ -127,26 +133,22 @@ class BestView(BestOf):
     def __init__(self, scorer: Scorer, views: Views, before: Views = ALONE, first: int = 0) -> None:
         after, known = (torch.tensor(one.among(views.shifts).penalties) for one in (views, before))
         super().__init__(scorer, len(views.shifts), after, known, first)
-        self.shifts = views.shifts
+        self.shifts, self.fov = views.shifts, views.fov
 
     def told(self, queries: Tensor, places: Tensor) -> dict[str, Tensor]:
         shift = torch.full(places.shape, torch.nan)
         if self.layout.places <= MOST_PLACES:
             every = (queries[:, None] * self.copies + torch.arange(self.copies)).flatten()
-            scores = self.scorer.rows(every).view(len(queries), self.copies, -1) / self.unit
+            scores = self.scorer.rows(every) / self.unit
+            scores = scores.view(len(queries), self.copies, scores.shape[1])
             at = places[:, None, :1].clamp(min=0).expand(-1, self.copies, -1)
             shift[:, 0] = shift_of(scores.gather(2, at.to(scores.device))[..., 0].cpu(), self.shifts)
-        return {"shift": shift}
+        return {"shift": shift} | ({} if self.fov is None else {"shift_degrees": degrees(shift, self.fov)})
 
 
-def degrees(shift: float, fov: float) -> float:
+def degrees(shift: Tensor, fov: float) -> Tensor:
     """By how many degrees a camera points to the right, by its shift and its horizontal field of view."""
-    return math.degrees(math.atan(2 * shift * math.tan(math.radians(fov) / 2)))
-
-
-def check_fov(fov: float | None) -> None:
-    """Refuse a field of view that no flat picture has."""
-    expect(fov is None or 0 < fov < WIDEST, f"degrees above 0 and below {WIDEST}", fov=fov)
+    return (2 * shift * math.tan(math.radians(fov) / 2)).atan().rad2deg()
 
 
 def best_pairs(scorer: Scorer, copies: int, queries: int) -> Match:

@@ -13,7 +13,7 @@ from dejavu_torch.recognition.calibration import Platt
 from dejavu_torch.recognition.localizer import Localizer, Matching, answer
 from dejavu_torch.recognition.querying import Querying
 from dejavu_torch.recognition.scorer import (
-    BestOf,
+    BestHeading,
     Cached,
     Earlier,
     OfMap,
@@ -70,20 +70,20 @@ def test_wrappers_commute_where_they_have_nothing_to_do_with_each_other(copies, 
     inner = OfRows(
         scores.__getitem__, noise(6 * copies, 3), Layout(9), lambda numbers, seed: scores[numbers] + seed
     )
-    one, other = BestOf(Reordered(inner, order), copies), Reordered(BestOf(inner, copies), order)
+    one, other = BestHeading(Reordered(inner, order), copies), Reordered(BestHeading(inner, copies), order)
     assert len(one) == len(other) == 6
     assert torch.equal(one.rows(every), other.rows(every))
     best = scores.view(6, copies, 9).amin(1)
     assert torch.equal(one.rows(every)[:, torch.arange(9)], best[:, order.argsort()])
     assert one.null is other.null is None  # a shuffled map has no order to ask for
-    assert torch.equal(BestOf(inner, copies).null(every, seed=2), best + 2)
+    assert torch.equal(BestHeading(inner, copies).null(every, seed=2), best + 2)
     places = one.rows(every).topk(2, 1, largest=False).indices
-    turn = BestOf(inner, copies).heading_at(every, order.argsort()[places])
+    turn = BestHeading(inner, copies).told(every, order.argsort()[places])["heading"]
     at = scores.view(6, copies, 9).gather(2, order.argsort()[places][:, None].expand(-1, copies, -1))
     assert torch.equal(turn, at.argmin(1) * (360 / copies))
-    assert torch.equal(one.heading_at(every, places), turn)
-    assert torch.equal(other.heading_at(every, places), turn)
-    assert Reordered(inner, order).heading_at(every, places) is None
+    assert torch.equal(one.told(every, places)["heading"], turn)
+    assert torch.equal(other.told(every, places)["heading"], turn)
+    assert Reordered(inner, order).told(every, places) == {}
     assert torch.equal(one.descriptors, inner.descriptors[::copies])
 
 
@@ -139,14 +139,14 @@ def test_a_wrapper_changes_what_a_model_finds():
 
 def test_what_was_scored_last_is_not_kept_of_a_whole_flight(monkeypatch):
     scores, every = noise(60, 7), torch.arange(30)
-    scorer = BestOf(OfRows(scores.__getitem__, noise(60, 3), Layout(7)), 2)
+    scorer = BestHeading(OfRows(scores.__getitem__, noise(60, 3), Layout(7)), 2)
     places = scorer.rows(every).argmin(1, keepdim=True)
     assert scorer.last is not None
-    known = scorer.heading_at(every, places)
+    known = scorer.told(every, places)["heading"]
     monkeypatch.setattr("dejavu_torch.recognition.scorer.SCORES_AT_ONCE", 60 * 7 - 1)
     scorer.rows(every)
     assert scorer.last is None
-    assert torch.equal(scorer.heading_at(every, places), known)
+    assert torch.equal(scorer.told(every, places)["heading"], known)
 
 
 def test_no_queries_have_no_headings(place_map):
