@@ -29,6 +29,7 @@ from benchmarks import (
     terrain,
     train,
     trainings,
+    views,
     visits,
 )
 from dejavu_torch.cli import errors_of_one_line, fail, main
@@ -50,6 +51,7 @@ BENCHES: dict[str, Any] = {  # each returns the lines to print
     "drives": drives.run_drives,
     "cross": cross.run_cross,
     "teaching": teaching.run_teaching,
+    "views": views.run_views,
     "visits": visits.run_visits,
     "alike": alike.run_alike,
     "features": features.run_features,

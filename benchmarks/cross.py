@@ -28,11 +28,14 @@ from dejavu_torch.evaluation.report import text_table
 from dejavu_torch.growth import calibrate_if_possible, merge
 from dejavu_torch.maps.spectral import SpectralMapper
 from dejavu_torch.model import DejaVu
+from dejavu_torch.recognition.centring import centred
 from dejavu_torch.recognition.filter import PlaceFilter
+from dejavu_torch.recognition.localizer import Matching
+from dejavu_torch.recognition.querying import Querying
 from dejavu_torch.recognition.smoother import PlaceSmoother
 from dejavu_torch.recognition.taken import NATS, PER_QUERY, STANDS_OUT
-from dejavu_torch.teaching import in_its_light
-from dejavu_torch.types import InputError, Traverse
+from dejavu_torch.recognition.views import Views
+from dejavu_torch.types import InputError, SequenceModel, Traverse
 
 ASKED = 400  # queries of a drive over another route, from its middle
 SHARES = (0.5, 0.9, 0.99)
@@ -148,7 +151,8 @@ MAPS = (*FOOTAGE, *AREAS, MERGED)
 
 
 class Board(NamedTuple):
-    """A map, the routes that it shows, and the drive over its own ground: descriptors (Q,K) and truth."""
+    """A map, the routes that it shows, and the drive over its own ground: descriptors of all views of its
+    queries, (Q, V x K), and truth."""
 
     model: DejaVu
     shows: tuple[str, ...]
@@ -262,7 +266,7 @@ def board_of(name: str, data: Path, rate: float | None = None) -> Board:
         places = first.layout.place_near(second.layout.coordinates(path))[:, None]
         radius = round(RADIUS / STRIDE)
         truth = widened(all_judged(places), first.layout, radius)
-        return Board(model, (name,), model.descriptor.all_of(Part(second, path)).float(), truth, radius)
+        return Board(model, (name,), described(model, Part(second, path)), truth, radius)
     routes: tuple[str, ...] = PARTS_OF_MERGED if name == MERGED else (name,)
     footage = FOOTAGE[routes[0]]
     reference, query = (opened(one, data) for one in (footage.reference, footage.query))
@@ -283,7 +287,18 @@ def board_of(name: str, data: Path, rate: float | None = None) -> Board:
         added = fitted(opened(FOOTAGE[routes[1]].reference, data), reference.frame_shape)
         other.learn_features(other.descriptor.all_of(added), added)
         model = merge([model, other], routes)
-    return Board(model, routes, model.descriptor.all_of(query).float(), truth, footage.tolerance)
+    return Board(model, routes, described(model, query), truth, footage.tolerance)
+
+
+def views_of(model: DejaVu) -> Views:
+    """Those of a drive on a map, before the drive has shown which are of use."""
+    return model.views_at_first(Querying(), len(model.frame_shape or ()) == 3, True)
+
+
+def described(model: DejaVu, drive: Traverse) -> Tensor:
+    """Descriptors of all views of the queries of a drive, (Q, V x K)."""
+    rows = model.descriptor.all_of(views_of(model).of(drive)).float()
+    return rows.reshape(len(drive), -1)
 
 
 def opened(source: str, data: Path) -> Traverse:
@@ -308,11 +323,11 @@ def asked_of(board: Board, data: Path) -> Iterator[tuple[str, Tensor]]:
         first = max(0, len(some) - most) // 2
         shape = board.model.frame_shape
         moved = query if shape is None else fitted(query, shape)
-        yield name, board.model.descriptor.all_of(Part(moved, some[first : first + most])).float()
+        yield name, described(board.model, Part(moved, some[first : first + most]))
     for name in AREAS if board.shows[0] in AREAS else ():
         if name not in board.shows:
             _, second, path = flown(name)
-            yield name, board.model.descriptor.all_of(Part(second, path)).float()
+            yield name, described(board.model, Part(second, path))
 
 
 def related(board: Board, drive: str) -> str:
@@ -339,17 +354,23 @@ def facts_of(board: Board, queries: Tensor, truth: GroundTruth | None = None) ->
         probabilities.
     """
     model, tolerance = board.model, board.tolerance
-    moved, smoother = in_its_light(model, queries), PlaceSmoother(within=max(1, tolerance))
-    drive = model.localize_descriptors(moved, model.matching(smoother)._replace(radius=tolerance))
+    views, count, smoother = views_of(model), len(queries), PlaceSmoother(within=max(1, tolerance))
+    queries = queries.reshape(count * len(views.shifts), -1)
+    moved = centred(model.map, queries, len(views.shifts)) if model.centres(count) else queries
+
+    def matching(way: SequenceModel | None = None) -> Matching:
+        return model.matching(way)._replace(radius=tolerance, wrappers=(views,))
+
+    drive = model.localize_descriptors(moved, matching(smoother))
     assert drive.smoother is not None
-    found: dict[str, Any] = {"queries": len(queries), "taken": drive.is_drive}
+    found: dict[str, Any] = {"queries": count, "taken": drive.is_drive, "views": drive.shift is not None}
     found |= {key: value for key, value in drive.smoother.settled().items() if isinstance(value, float)}
     ways = {"drive": drive}
     within = {1: max(1, tolerance), 2: 0}[model.map.layout.dimensions]  # the truth has all windows of an area
     if model.calibration is not None:
-        ways["one"] = model.localize_descriptors(moved, model.matching()._replace(radius=tolerance))
+        ways["one"] = model.localize_descriptors(moved, matching())
         if model.calibration.filter is not None:
-            ways["filter"] = model.localize_descriptors(queries, model.matching(PlaceFilter()))
+            ways["filter"] = model.localize_descriptors(queries, matching(PlaceFilter()))
     for way, match in ways.items():
         assert match.probability is not None
         probability = match.probability

@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from importlib import import_module
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -26,7 +26,8 @@ from dejavu_torch.model import DejaVu, require_map
 from dejavu_torch.recognition.calibration import POWER
 from dejavu_torch.recognition.calibration import TOLERANCE as BEYOND
 from dejavu_torch.recognition.centring import running_mean
-from dejavu_torch.recognition.views import ALONE
+from dejavu_torch.recognition.querying import Sequences
+from dejavu_torch.recognition.views import ALONE, Views
 from dejavu_torch.text import one_line
 from dejavu_torch.types import Facts, InputError, SequenceModel, expect
 from dejavu_torch.version import __version__
@@ -108,10 +109,12 @@ class Graph(nn.Module):
 
     penalties: Tensor
 
-    def __init__(self, model: DejaVu, sequence: SequenceModel | None = None, centred: bool = False) -> None:
+    def __init__(
+        self, model: DejaVu, sequence: SequenceModel | None, centred: bool, views: Views = ALONE
+    ) -> None:
         super().__init__()
         parts: dict[str, nn.Module] = {}
-        shape, (shifts, penalties) = model.frame_shape or (), (model.views or ALONE).known
+        shape, (shifts, penalties) = model.frame_shape or (), views.known
         self.views = len(shifts)
         self.register_buffer("penalties", torch.tensor(penalties)[:, None])
         if len(shape) == 3:
@@ -150,7 +153,11 @@ class Graph(nn.Module):
 
 
 def export_onnx(
-    model: DejaVu, path: str | Path, sequence: SequenceModel | None = None, centre: bool = False
+    model: DejaVu,
+    path: str | Path,
+    sequence: SequenceModel | None = None,
+    centre: bool = False,
+    shifts: Literal["auto", "none"] | list[float] = "auto",
 ) -> Exported:
     """Write preprocessing, features, whitening, map and scores as one ONNX file, opset 18.
 
@@ -160,6 +167,7 @@ def export_onnx(
         sequence: a `SequenceMatcher` or a `PlaceFilter`. The file then maps one frame and the state before it
             to scores and the next state, see `SequenceModel.step`.
         centre: remove the mean of the frames so far from each, see `RunningMean`, which is a state as well.
+        shifts: views of each frame, of which the best has the scores; "auto" are those that the map knows.
 
     Shape: `frames` (B,C,H,W) float32 in [0, 1] -> `scores` (B,N), for any B, H and W: frames are resized to
         the size of the map's. For a map of ready features the input is `features` (B,D). With a sequence
@@ -199,11 +207,13 @@ def export_onnx(
     seen = f"{model.map.places} places of {model.map.dimension} dimensions need {size / 1e9:.1f} GB"
     expect(size <= MAX_BYTES, f"at most {MAX_BYTES / 1e9:.1f} GB in an ONNX file", seen)
     device = model.map.device
-    graph = Graph(model, sequence, centre)
+    images = len(model.frame_shape) == 3
+    views = model.views_at_first(Sequences(shifts=shifts), images, learns=False)
+    graph = Graph(model, sequence, centre, views)
     shape, generator = (TRIED, *model.frame_shape), torch.Generator().manual_seed(0)
     noise = torch.rand(shape, generator=generator, dtype=torch.float32).to(device)
     noise[1:, ..., : noise.shape[-1] // 2], noise[2:] = 0, 0  # half a flat frame, a flat frame
-    facts = _facts(model, sequence, centre)
+    facts = _facts(model, sequence, centre, views)
     with torch.no_grad(), in_mode(graph, False), _quiet():
         states = [first.to(device) for first in _first_states(facts)]
         inputs = noise[: 2 if sequence is None else 1], *states
@@ -250,7 +260,7 @@ def _first_states(facts: Facts) -> list[Tensor]:
     return [torch.full(shape, first[name]) for name, shape in facts["inputs"].items() if name in first]
 
 
-def _facts(model: DejaVu, sequence: SequenceModel | None, centre: bool) -> Facts:
+def _facts(model: DejaVu, sequence: SequenceModel | None, centre: bool, views: Views) -> Facts:
     """The metadata; free dimensions have a name."""
     shape, places = list(model.frame_shape or ()), model.map.places
     name, sizes = ("frames", [*shape[:1], "height", "width"]) if len(shape) == 3 else ("features", shape)
@@ -272,7 +282,7 @@ def _facts(model: DejaVu, sequence: SequenceModel | None, centre: bool) -> Facts
         facts["sequence"] = str(sequence)
         threshold = sequence.threshold_of(model.threshold)
         threshold = sequence.likely if threshold is None else threshold  # without a calibration
-    shifts, penalties = (model.views or ALONE).known
+    shifts, penalties = views.known
     if shifts != ALONE.shifts:
         facts["views"] = dict(zip(map(str, shifts), penalties, strict=True))
     if centre:

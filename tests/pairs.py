@@ -162,6 +162,7 @@ ACTIONS = {
     "filter": Action(ask=(MATCH, "filter")),
     "drive": Action(ask=(MATCH, "drive")),
     "headings": Action(ask=("--headings", "4")),
+    "views": Action(ask=("--shifts", "[-.1,.1]")),
     "second": Action(learn=("--second", "{second}", "--second_truth", "{truth}")),
     "refine": Action(edit=("refine", "{map}", "{drive}")),
     "update": Action(edit=("update", "{map}", "{drive}")),
@@ -189,7 +190,7 @@ FIXED = (  # a minute of them, in `.ci/run`
     *(("merged", "single"), ("grown", "drive"), ("refined", "filter"), ("ready descriptors", "export")),
     *(("even steps", "drive"), ("templates", "sequence"), ("area", "refine"), ("route", "append")),
     *(("route", "filter", "second"), ("route", "average", "export"), ("route", "precision", "live")),
-    ("route", "filter", "append"),
+    *(("route", "filter", "append"), ("route", "drive", "views")),
 )
 
 

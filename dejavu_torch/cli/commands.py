@@ -166,7 +166,7 @@ def run_export(
     options.Acceptance(threshold).of(model)
     seen = f"the map's precision, {model.precision}, only holds for single frames in an ONNX file"
     expect(matcher is None or model.precision is None, "--threshold with a sequence or a filter", seen)
-    written = export_onnx(model, onnx, matcher, centre == "mean")
+    written = export_onnx(model, onnx, matcher, centre == "mean", sequences.shifts)
     for kind in ("inputs", "outputs"):
         shapes = (f"{name} {tuple(shape)}" for name, shape in written.facts[kind].items())
         print(f"{kind}: {', '.join(shapes)}".replace("'", ""))

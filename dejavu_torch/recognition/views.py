@@ -26,7 +26,8 @@ FIRST, LEAST = 100, 40  # queries that penalties are learned from; fewer do not 
 SURE, ROUNDS = 1 / 3, 4  # share of the answers that tell, the surest; times that they are asked
 START, NATS = 0.08, 0.04  # first penalty of a moved view, and for each nat by which it is rarer
 AS_IT_IS, OTHER = 2.0, 0.3  # answers by the unmoved view, and by each other, that are taken for granted
-STEADY = 3  # places between the answers of neighbouring queries; views are of use if more are as near
+STEP = 3  # places, from 1 on, between the answers of a query and the next where a camera moves on
+MORE = 0.03  # share of the queries where it has to do so more often with moved views, beside chance
 CHANCE = 0.08  # share of the answers below which a view is left out; by chance each has one of thirteen
 FLAT = 0.02  # of the unit of scores: if those of all views differ less, they do not tell the shift
 WIDEST = 180  # degrees of a field of view
@@ -166,7 +167,7 @@ def best_pairs(scorer: Scorer, copies: int, queries: int) -> Match:
 def penalties_of(pairs: Match, layout: Layout) -> Tensor:
     """The penalty of each view, (V,), by the `best_pairs` of queries: the fewer of the surest answers a view
     gives, the more it costs, and +inf if these are hardly more than by chance. Moved views are left out
-    unless answers of neighbouring queries are then nearer to each other."""
+    unless answers then follow each other more often."""
     each = min(2, layout.places)
     copies = pairs.score.shape[1] // each
     alone = torch.full((copies,), math.inf).index_fill(0, torch.tensor(0), 0.0)
@@ -176,9 +177,10 @@ def penalties_of(pairs: Match, layout: Layout) -> Tensor:
         total = pairs.score + penalties.to(pairs.score).repeat_interleave(each)
         return best_candidates(total, each, TOLERANCE, pairs.index, layout)
 
-    def steady(penalties: Tensor) -> int:
+    def steps(penalties: Tensor) -> int:
         place = answered(penalties).index[:, 0].clamp(min=0)
-        return int((layout.distance(place[1:], place[:-1]) <= STEADY).sum())
+        distance = layout.distance(place[1:], place[:-1])
+        return int(((distance >= 1) & (distance <= STEP)).sum())
 
     for _ in range(ROUNDS):
         sure = confidence(answered(penalties)).topk(max(1, int(SURE * len(pairs)))).indices
@@ -188,7 +190,10 @@ def penalties_of(pairs: Match, layout: Layout) -> Tensor:
         share = answers / answers.sum()
         penalties = NATS * (share.max() / share).log()
     penalties = torch.where(share < CHANCE, math.inf, penalties).float()
-    return penalties if steady(penalties) > steady(alone) else alone
+    chance = math.sqrt(
+        len(pairs) * 2 * STEP / layout.places
+    )  # a standard deviation of what is near by chance
+    return penalties if steps(penalties) >= steps(alone) + max(MORE * len(pairs), chance) else alone
 
 
 def shift_of(scores: Tensor, shifts: tuple[float, ...]) -> Tensor:

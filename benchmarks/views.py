@@ -1,0 +1,118 @@
+"""`benchmarks views`: images compared as they are, and moved sideways as well."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Literal
+
+from tqdm import tqdm
+
+from benchmarks.cross import FOOTAGE as EVERY
+from benchmarks.measure import Column, Row, new_row, table, truth_of, write_bench
+from dejavu_torch.data.ground_truth import GroundTruth
+from dejavu_torch.data.source import open_source
+from dejavu_torch.data.traverse import Cropped, Part
+from dejavu_torch.evaluation.curves import area, by_confidence, curve_of, evaluate
+from dejavu_torch.evaluation.rejection import calibration_error, judged
+from dejavu_torch.growth import calibrate_if_possible
+from dejavu_torch.maps.spectral import SpectralMapper
+from dejavu_torch.model import DejaVu
+from dejavu_torch.recognition.querying import Querying
+from dejavu_torch.recognition.smoother import PlaceSmoother
+from dejavu_torch.types import InputError, Match, Traverse
+
+FOOTAGE = {name: one for name, one in EVERY.items() if one.features == "images"}
+CHOSEN = tuple(FOOTAGE)[::2]  # constants were chosen on these, and the others tried afterwards
+MARGIN = 0.2  # of the width that is cut off on either side, so that the second visit can show another part
+POINTED = (0.0, 0.1, -0.17, 0.24)  # of what is left: by how much the second camera points to the right
+RATES = {"default": None, "half a byte": 0.5}
+ASKED = 1000  # queries, from the middle
+WAYS: tuple[Literal["none", "auto"], ...] = ("none", "auto")
+KEYS = ("rate", "half", "shift", "views", "auc_one", "auc", "error", "shift_error", "ms", "missed")
+
+
+def pointed(reference: Traverse, query: Traverse, shift: float) -> tuple[Traverse, Traverse, float]:
+    """The middle of the frames of a reference, a part of a query's further right, and how far that is."""
+    width = reference.frame_shape[2]
+    margin, other = round(MARGIN * width), round(MARGIN * query.frame_shape[2])
+    aside = round(shift * (query.frame_shape[2] - 2 * other))
+    cut = Cropped(query, (0, 0, other + aside, other - aside))
+    return Cropped(reference, (0, 0, margin, margin)), cut, aside / (query.frame_shape[2] - 2 * other)
+
+
+def bench_views(name: str, data: Path, rate: str, shift: float | None) -> Iterator[Row]:
+    """A row for each way on the map of a route.
+
+    Args:
+        shift: of a second camera that sees a part of the frames; None: the visits are as they are.
+
+    Yields:
+        auc_one, auc: of single images in order, by confidence, and of the whole drive. error: of the
+        probabilities of single images. views: that answer. shift, shift_error: known, and median. ms: of
+        processor time for a query, describing included. missed: why there is no map.
+    """
+    one = FOOTAGE[name]
+    reference, query = (open_source(source.format(data=data)) for source in (one.reference, one.query))
+    truth = truth_of(reference, query, one.truth and one.truth.format(data=data))
+    known = None
+    if shift is not None:
+        reference, query, known = pointed(reference, query, shift)
+    first = max(0, len(query) - ASKED) // 2
+    some = range(first, min(len(query), first + ASKED))
+    query, truth = Part(query, some), GroundTruth(*(column[some.start : some.stop] for column in truth))
+    model = DejaVu(mapper=SpectralMapper(RATES[rate]))
+    half = "chosen on" if name in CHOSEN else "reported"
+    row = new_row(name, "none", KEYS, rate=rate, half=half, shift=known)
+    try:
+        model.learn(reference)
+    except InputError as error:
+        yield row | {"missed": str(error)}
+        return
+    calibrate_if_possible(model, reference)
+    for way in WAYS:
+        asked = Querying(ordered=True, shifts=way)
+        began = time.process_time()
+        drive = _all(model, query, replace(asked, match=PlaceSmoother(within=max(1, one.tolerance))))
+        passed = 1000 * (time.process_time() - began) / len(query)
+        centre: Literal["mean", "none"] = "mean" if model.centres(len(query)) else "none"
+        alone = _all(model, query, replace(asked, match="single", centre=centre))
+        figures: dict[str, Any] = {"auc_one": area(curve_of(by_confidence(alone), truth, one.tolerance))}
+        figures |= {"auc": evaluate(drive, truth, one.tolerance).auc, "ms": passed}
+        if alone.probability is not None:
+            figures["error"] = calibration_error(*judged(alone, truth, max(1, one.tolerance)))
+        if drive.shift is not None and known is not None:
+            figures["shift_error"] = float((drive.shift - known).abs().nanmedian())
+        yield row | {"contender": way, "views": drive.shift is not None} | figures
+
+
+def _all(model: DejaVu, query: Traverse, querying: Querying) -> Match:
+    return Match.joined(model.matches(query, querying))
+
+
+COLUMNS: dict[str, Column] = {
+    **{"one image": ("auc_one", ".3f"), "whole drive": ("auc", ".3f"), "error": ("error", ".3f")},
+    **{"shift": ("shift", ".2f"), "its error": ("shift_error", ".3f"), "ms": ("ms", ".1f")},
+}
+
+
+def run_views(data: Path, *, out: Path, routes: Sequence[str] = ()) -> list[str]:
+    """Images compared as they are and moved sideways: AUC of one image and of the whole drive, and the shift.
+
+    Args:
+        data: folder of the footage, as for the tests
+        out: folder for bench.json
+        routes: names of routes; all if not given
+    """
+    if unknown := [name for name in routes if name not in FOOTAGE]:
+        raise InputError(f"{unknown[0]!r} is no route; expected one of {', '.join(map(repr, FOOTAGE))}")
+    some = routes or tuple(FOOTAGE)
+    planned = [(name, rate, None) for rate in RATES for name in some]
+    planned += [(name, "default", shift) for shift in POINTED for name in some]  # type: ignore[misc]
+    rows: list[Row] = []
+    for name, rate, shift in tqdm(planned, "routes", disable=None, leave=False):
+        rows += bench_views(name, data, rate, shift)
+        write_bench(out, rows)
+    return [table(rows, COLUMNS, "{case}, {rate}, {contender}"), "AUC; shares of the width"]
