@@ -309,6 +309,13 @@ def test_a_filter_answers_as_it_does_live(model):
     assert report.run.match.index.tolist() == match.index.tolist()
 
 
+def test_a_filter_whose_given_views_are_of_no_use_answers_each_query(model):
+    for drive in (visit(1), Part(visit(1), range(105))):
+        match = model.localize(drive, sequence=PlaceFilter(), shifts=[0.1])
+        assert len(match) == len(drive)
+        assert found(match) >= 0.95
+
+
 def test_live_describes_one_view_where_no_other_is_of_use(model, monkeypatch):
     live, seen = LiveLocalizer(model), []
     own = Descriptor.describe_moved

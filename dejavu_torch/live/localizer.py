@@ -112,7 +112,7 @@ class LiveLocalizer:
         self.scores: Tensor | None = None
         place_map = self.model.map
         self._mean = torch.zeros(place_map.dimension + 1, device=place_map.device)  # of the frames so far
-        matching, self._driven = self.model.matching(self.sequence), self._views.as_it_drives()
+        matching, self._driven = self.model.matching(self.sequence), self._views.as_it_drives(describes=True)
         keep = self._keep if self.keep_scores else None
         wrappers = () if self._views == ALONE else (self._driven,)
         self._localizer = self.model.localizer(matching._replace(callback=keep, wrappers=wrappers))

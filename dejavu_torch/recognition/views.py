@@ -85,9 +85,9 @@ class Views:
         """The same views with the penalties that the `best_pairs` of queries tell."""
         return replace(self, penalties=tuple(penalties_of(pairs, layout).tolist()), learns=False)
 
-    def as_it_drives(self) -> Driven:
-        """The same, for consecutive queries, of which none knows those after it."""
-        return Driven(self)
+    def as_it_drives(self, describes: bool = False) -> Driven:
+        """The same, for consecutive queries, of which none knows those after it; see `Driven`."""
+        return Driven(self, describes)
 
     def among(self, shifts: tuple[float, ...] = SHIFTS) -> Views:
         """The same views among others, which are left out."""
@@ -100,17 +100,17 @@ ALONE = Views()
 
 class Driven:
     """The best views of consecutive queries, batch by batch: penalties are learned from the first `FIRST` of
-    them, and hold for those after these."""
+    them, and hold for those after these. describes: scorers have only the copies by `shifts`."""
 
-    def __init__(self, views: Views) -> None:
-        self.views, self.before, self.seen = views, views, 0
+    def __init__(self, views: Views, describes: bool = False) -> None:
+        self.views, self.before, self.describes, self.seen = views, views, describes, 0
         self.pairs: list[Match] = []
 
     @property
     def shifts(self) -> tuple[float, ...]:
         """Of the copies of the next query: only the unmoved one, if no other is of use."""
-        used = self.views.learns or self.views.fov is not None or self.views.known[0] != ALONE.shifts
-        return self.views.shifts if used else ALONE.shifts
+        alone = not self.views.learns and self.views.fov is None and self.views.known[0] == ALONE.shifts
+        return ALONE.shifts if alone and self.describes else self.views.shifts
 
     def __call__(self, scorer: Scorer) -> Scorer:
         """The scores of the best views; `scorer` has those of all views of the next queries."""

@@ -705,8 +705,8 @@ MUTANTS = [
     Mutant(
         "A stop counts once in the mean of the queries.",
         "dejavu_torch/recognition/centring.py",
-        "queries.any(1) / run_lengths(unchanged(queries)).to(queries)",
-        "queries.any(1).to(queries)",
+        "own.any(1) / run_lengths(unchanged(own)).to(queries)",
+        "own.any(1).to(queries)",
         ("tests/recognition/test_centring.py::-k stop",),
     ),
     Mutant(
@@ -1121,5 +1121,47 @@ MUTANTS = [
         "Matching(platt=model.calibration and model.calibration.single)",
         "Matching()",
         ("tests/evaluation/test_compare.py::-k single_images_beside",),
+    ),
+    Mutant(
+        "A histogram beyond the border of an image is mirrored.",
+        "dejavu_torch/features/hog.py",
+        "lambda seen: seen.flip(1)",
+        "None",
+        ("tests/test_views.py::-k mirrored",),
+    ),
+    Mutant(
+        "A view that gives no more answers than chance is left out.",
+        "dejavu_torch/recognition/views.py",
+        "share < CHANCE, math.inf",
+        "share < 0, math.inf",
+        ("tests/test_views.py::-k chance",),
+    ),
+    Mutant(
+        "Views by which answers follow each other no more often are left out.",
+        "dejavu_torch/recognition/views.py",
+        "(distance >= 1) & (distance <= STEP)",
+        "distance <= STEP",
+        ("tests/test_views.py::-k follow_each_other",),
+    ),
+    Mutant(
+        "Penalties are in units of the scores.",
+        "dejavu_torch/recognition/scorer.py",
+        "own = self.unit * self.penalties",
+        "own = self.penalties",
+        ("tests/test_views.py::-k units",),
+    ),
+    Mutant(
+        "A filter answers by no view that only later queries tell.",
+        "dejavu_torch/recognition/scorer.py",
+        "(queries < self.first).long()",
+        "(queries < 0).long()",
+        ("tests/test_views.py::-k live",),
+    ),
+    Mutant(
+        "Frames of a drive teach by the view that looks as at learning.",
+        "dejavu_torch/teaching.py",
+        "* best.copies + copy",
+        "* best.copies",
+        ("tests/test_views.py::-k placed_by",),
     ),
 ]
