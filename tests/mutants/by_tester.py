@@ -1127,7 +1127,7 @@ MUTANTS = [
         "dejavu_torch/features/hog.py",
         "lambda seen: seen.flip(1)",
         "None",
-        ("tests/test_views.py::-k mirrored",),
+        ("tests/test_views.py::-k reflected_cell",),
     ),
     Mutant(
         "A view that gives no more answers than chance is left out.",
