@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from itertools import groupby
 from pathlib import Path
-from statistics import mean
+from statistics import mean, median
 from typing import Any
 
 from benchmarks.alike import CAPPED, CHECKED, PRECISIONS, SINGLE, UNCAPPED
@@ -28,6 +28,7 @@ from benchmarks.storage import SHOWN, best, by, families, missed
 from benchmarks.storage_drives import drive_table
 from benchmarks.teaching import COPIES, PLACED, REFINED, TOLD
 from benchmarks.terrain import NAMES as TERRAIN_WAYS
+from benchmarks.views import POINTED, POINTED_WITHIN, WAYS
 from dejavu_torch.evaluation.baselines import every
 from dejavu_torch.evaluation.contenders import LENGTHS
 from dejavu_torch.recognition.calibration import POWER
@@ -235,6 +236,36 @@ def ordered() -> str:
         pair = [own[name] for name in ("score", f"score / elsewhere^{POWER:g}")]
         cells = (f"{area(row['auc'])} / {area(row['recall_at_99_precision'])}" for row in pair)
         table.append([f"`{case}`" if case.startswith("sim:") else case, pair[0]["half"], *cells])
+    return markdown(table)
+
+
+def views() -> str:
+    """One image and the whole drive, as they are and by views, by how far the second camera points aside."""
+    columns = ("one image", "by views", "worst", "whole drive", "by views", "worst", "shift, median error")
+    table = [["mean AUC", "routes", *columns]]
+    cases: list[tuple[str, str, float | None]] = [("as filmed", "default", None)]
+    cases += [("as filmed, half a byte", "half a byte", None)]
+    cases += [
+        (f"cut, pointing {100 * shift:+.0f} % of the width aside", "default", shift) for shift in POINTED
+    ]
+    for name, rate, shift in cases:
+        rows = [row for row in read("views")["rows"] if row["rate"] == rate and row["auc"] is not None]
+        if shift is None:
+            own = by("case", [row for row in rows if row["shift"] is None])
+        else:
+            some = [row for row in rows if row["shift"] is not None]
+            own = by("case", [row for row in some if abs(row["shift"] - shift) < POINTED_WITHIN])
+        cells = [str(len(own))]
+        for key in ("auc_one", "auc"):
+            each = [
+                [{row["contender"]: row for row in pair}[way][key] for way in WAYS] for pair in own.values()
+            ]
+            cells += [area(mean(column)) for column in zip(*each, strict=True)]
+            cells.append(f"{min(views - alone for alone, views in each):+.3f}")
+        errors = [
+            row["shift_error"] for pair in own.values() for row in pair if row["shift_error"] is not None
+        ]
+        table.append([name, *cells, f"{100 * median(errors):.1f} %" if errors else ""])
     return markdown(table)
 
 
@@ -567,6 +598,7 @@ def trainings() -> str:
 TABLES: dict[str, Callable[[], str]] = {
     **{"leaderboard": leaderboard, "sure": sure, "losses": losses, "routes": routes},
     **{"demo": demo, "front": front, "files": sizes, "order": order, "ordered": ordered},
+    "views": views,
     **{"descriptors": descriptors, "sequences": sequences},
     **{"rejection": rejection, "filtered": filtered, "drives": drives, "driven": driven},
     **{"trainings": trainings, "made drives": made_drives, "storage drives": storage_drives},

@@ -27,6 +27,7 @@ from dejavu_torch.recognition.calibration import POWER
 from dejavu_torch.recognition.calibration import TOLERANCE as BEYOND
 from dejavu_torch.recognition.centring import running_mean
 from dejavu_torch.recognition.querying import Sequences
+from dejavu_torch.recognition.scorer import OfMap
 from dejavu_torch.recognition.views import ALONE, Views
 from dejavu_torch.text import one_line
 from dejavu_torch.types import Facts, InputError, SequenceModel, expect
@@ -116,7 +117,9 @@ class Graph(nn.Module):
         parts: dict[str, nn.Module] = {}
         shape, (shifts, penalties) = model.frame_shape or (), views.known
         self.views = len(shifts)
-        self.register_buffer("penalties", torch.tensor(penalties)[:, None])
+        none = torch.zeros(1, model.map.dimension, device=model.map.device)
+        unit = OfMap(model.map, none).unit
+        self.register_buffer("penalties", unit * torch.tensor(penalties)[:, None].to(none))
         if len(shape) == 3:
             parts |= {"size": Resized((shape[1], shape[2]))}
         if len(shape) != 1:

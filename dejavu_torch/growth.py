@@ -26,6 +26,7 @@ from dejavu_torch.places.frame_table import FrameTable
 from dejavu_torch.places.layout import agree
 from dejavu_torch.places.positions import positions_behind
 from dejavu_torch.recognition.calibration import strictest
+from dejavu_torch.recognition.views import ALONE
 from dejavu_torch.teaching import FEWEST, calibrate_by, place_drives
 from dejavu_torch.types import InputError, Traverse, expect
 
@@ -414,7 +415,8 @@ def merge(models: Sequence[DejaVu], names: Sequence[str]) -> DejaVu:
     frames = [model.map.table.frames for model in models]
     trained = first.trained if all(model.trained == first.trained for model in models) else None
     names = joined_names([model.frame_names for model in models], frames)
-    views = first.views if all(one.views == first.views for one in models) else None
+    looks = {one.views for one in models}
+    views = ALONE if ALONE in looks else first.views if len(looks) == 1 else None
     merged.state = ModelState(first.frame_shape, first.step, trained, names, views=views)
     dropped = [
         *["thresholds"] * (len(thresholds) > 1),

@@ -265,7 +265,8 @@ def turn_windows(place_map: SpectralMap, descriptor: Descriptor, traverse: Trave
 def looks_along(place_map: PlaceMap, descriptor: Descriptor, traverse: Traverse) -> bool:
     """Whether images that are moved sideways show other places of the route, as where a camera looks down and
     drives to its side: most of those that are moved farthest surely look like places elsewhere."""
-    if not (place_map.layout.ahead and descriptor.moves) or place_map.fidelity is None:
+    ahead = place_map.layout.ahead and descriptor.moves and place_map.fidelity is not None
+    if not ahead or not descriptor.fits(place_map.dimension, traverse):
         return False
     count, shifts = min(MOVED, len(traverse)), (max(SHIFTS), min(SHIFTS))
     some = torch.linspace(0, len(traverse) - 1, count).round().long()

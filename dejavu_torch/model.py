@@ -565,6 +565,8 @@ class DejaVu(nn.Module):
             expect(images, "images, on the spectral map of a route", f"shifts {asked}")
             return Views.given(asked, learns, querying.fov)
         if asked == "none" or not (images and self.descriptor.moves) or known == ALONE:
+            expected = "images, on the spectral map of a route, of a camera that looks ahead"
+            expect(querying.fov is None, expected, fov=querying.fov)
             return ALONE
         return replace((known or ALONE).among(), learns=learns, fov=querying.fov)
 
@@ -589,12 +591,15 @@ class DejaVu(nn.Module):
     def look_at(self, visit: Traverse | AugmentedFrames) -> DejaVu:
         """Let single images be compared with the views that another visit, in order, shows to be of use."""
         drive = hasattr(visit, "layout") and self.views is None  # copies of frames lie nowhere
-        if drive and len(visit) >= LEAST:
+        if drive and len(visit) >= LEAST and self.descriptor.fits(self.map.dimension, visit):
             first = Part(cast(Traverse, visit), range(min(FIRST, len(visit))))
-            querying = self.looking(first, QUERYING, True, self.centres(len(first)))
+            centres = self.centres(len(first))
+            querying = self.looking(first, QUERYING, True, centres)
             if querying.views != ALONE:
-                rows = centred(self.map, self.descriptor.all_of(querying.views.of(first)), querying.copies)
-                self.views = Views(*querying.views.learned(self.scorer(rows)).known)
+                rows = self.descriptor.all_of(querying.views.of(first))
+                rows = centred(self.map, rows, querying.copies) if centres else rows
+                known = querying.views.learned(self.scorer(rows)).with_unmoved
+                self.views = None if known.shifts == ALONE.shifts else known
         return self
 
     def centres(self, queries: int) -> bool:

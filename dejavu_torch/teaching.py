@@ -63,8 +63,13 @@ def straightened(model: DejaVu, drive: Traverse, progress: bool = False) -> Tens
     best = views(model.scorer(centred(model.map, rows, len(rows) // count) if centres else rows))
     match = answer(best, model.matching(PlaceSmoother()))
     assert isinstance(best, BestView)
+    if not match.is_drive or match.probability is None:
+        return rows[:: best.copies]
     parts = torch.arange(count).split(max(1, best.at_once // model.map.places))
     copy = torch.cat([best.copy_at(part, match.index[part, None])[:, 0].cpu() for part in parts])
+    sure = match.probability >= SURE
+    usual = int(copy[sure if sure.any() else ~sure].mode().values)
+    copy = torch.where(sure, copy, usual)  # of frames whose place is not known
     return rows[(torch.arange(count) * best.copies + copy).to(rows.device)]
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import csv
 import json
 import math
@@ -13,7 +14,16 @@ import torch.nn.functional as F
 from command_line import run
 from helpers import refused
 
-from dejavu_torch import DejaVu, LiveLocalizer, Match, PlaceFilter, Whitening, compare, open_source
+from dejavu_torch import (
+    DejaVu,
+    LiveLocalizer,
+    Match,
+    PlaceFilter,
+    SpectralMapper,
+    Whitening,
+    compare,
+    open_source,
+)
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.moving import Moved, moved
 from dejavu_torch.data.traverse import Part
@@ -25,7 +35,7 @@ from dejavu_torch.features.hog import HOG
 from dejavu_torch.features.joined import Joined
 from dejavu_torch.features.pixels import PatchPixels
 from dejavu_torch.features.views import LabelledFrames
-from dejavu_torch.growth import calibrate_if_possible
+from dejavu_torch.growth import calibrate_if_possible, merge
 from dejavu_torch.places.layout import ROUTE
 from dejavu_torch.recognition.querying import Querying, Sequences
 from dejavu_torch.recognition.scorer import BestOf, OfMap, OfRows, OfStored
@@ -203,8 +213,8 @@ def pairs_of(answers, copies, places=400):
     count = len(answers)
     index = torch.randint(places, (count, copies, 2), generator=draw)
     score = 0.6 + 0.1 * torch.rand(count, copies, 2, generator=draw).sort(2).values
-    for i, copy in enumerate(answers):
-        index[i, copy, 0], score[i, copy, 0] = i, 0.1 + 0.3 * float(torch.rand(1, generator=draw))
+    for i, view in enumerate(answers):
+        index[i, view, 0], score[i, view, 0] = i, 0.1 + 0.3 * float(torch.rand(1, generator=draw))
     pair = Match(index.flatten(1), score.flatten(1), torch.ones(count, 2 * copies, dtype=torch.bool))
     return pair, ROUTE.reaching(places)
 
@@ -348,6 +358,8 @@ def test_a_visit_shows_the_views_of_single_images(tmp_path, model):
     assert found(match) >= found(plain) + 0.1
     alone = Match.joined(own.matches(Part(visit(1, OFFSET), range(9, 10)), images))
     assert alone.index[0] == match.index[9]
+    as_before = Match.joined(own.matches(visit(3), images))  # another camera may still have taken one
+    assert found(as_before) >= 0.9
     own.save(tmp_path / "map.safetensors")
     loaded = DejaVu.load(tmp_path / "map.safetensors")
     assert loaded.views == own.views
@@ -356,6 +368,28 @@ def test_a_visit_shows_the_views_of_single_images(tmp_path, model):
     assert exported.facts["views"].keys() == {str(shift) for shift in own.views.shifts}
     scores = run_session(session_of(tmp_path / "map.onnx"), visit(1, OFFSET)[:])
     assert torch.allclose(scores.amin(1), match.score, atol=1e-3)
+
+
+def test_penalties_of_exported_views_are_in_units_of_the_scores(tmp_path):
+    own = DejaVu(whitening=Whitening(48, views=1), mapper=SpectralMapper(metric="l2")).learn(visit(0))
+    export_onnx(own, tmp_path / "map.onnx", shifts=[OFFSET])
+    scores = run_session(session_of(tmp_path / "map.onnx"), visit(1, OFFSET)[:])
+    match = Match.joined(own.matches(visit(1, OFFSET), Querying(unordered=True, shifts=[OFFSET])))
+    assert torch.allclose(scores.amin(1), match.score, atol=1e-3, rtol=1e-3)
+
+
+def test_ready_features_of_images_are_not_described_again():
+    rows = torch.randn(PLACES, 16)
+    for own in (DejaVu(whitening="none"), DejaVu()):
+        second = LabelledFrames(visit(2), torch.arange(PLACES))
+        assert own.learn_features(rows, visit(0), second).views is None
+
+
+def test_merged_maps_have_views_if_each_has(model):
+    looks = [copy.deepcopy(model) for _ in range(2)]
+    for views, expected in ((ALONE, ALONE), (Views((0.0, 0.1), (0.0, 0.1)), None), (None, None)):
+        looks[0].views = views
+        assert merge(looks, ["one", "two"]).views == expected
 
 
 def test_a_drive_without_truth_is_placed_by_its_views():
@@ -426,6 +460,8 @@ def test_what_has_no_views_is_refused():
     assert ready.localize(ArrayTraverse(rows)).shift is None
     with refused("shifts [0.1]; expected images, on the spectral map of a route"):
         ready.localize(rows, shifts=[0.1])
+    with refused("fov is 90; expected images, on the spectral map of a route"):
+        [*ready.matches(rows, Querying(fov=90))]
     with pytest.raises(ValueError, match="expected some up to"):
         Views.given([0.7])
 

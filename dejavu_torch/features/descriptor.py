@@ -180,6 +180,12 @@ class Descriptor(nn.Module):
         """Whether views of a frame share most of what is computed, so that they cost little."""
         return moves(self.features)
 
+    def fits(self, dimension: int, traverse: Traverse | AugmentedFrames) -> bool:
+        """Whether it describes a traverse in so many dimensions, as those of a map that others made."""
+        if self.whitening is not None and not self.whitening.learned:
+            return False
+        return next(self.batches(Part(cast(Traverse, traverse), range(1)))).shape[1] == dimension
+
     @property
     def sharing(self) -> Sharing:
         """Describes windows of a picture with what they share."""

@@ -64,7 +64,8 @@ class LiveLocalizer:
     Attributes:
         scores: (N,) of the latest answer, on the model's device; None before the first, or if not kept.
 
-    Convention: the answers equal those of `DejaVu.localize` up to rounding. A refused frame changes nothing.
+    Convention: the answers equal those of `DejaVu.localize` up to rounding; without a sequence, the first 100
+        of a drive know no views yet. A refused frame changes nothing.
         `left_out` in `localizer(frame, left_out)` is the number of frames skipped before this one: a
         `PlaceFilter` moves once more for each. With a `PlaceFilter` that has a lag, `due(frame, left_out)`
         gives the answers that this frame completes, none or one, in the order of the frames, and `finish()`
@@ -205,7 +206,8 @@ class LiveLocalizer:
             check_queries(self.model, tuple(batch.shape[1:]), features.shape[1], "the frame")
             self._shape = batch.shape[1:]
         features = features.to(torch.promote_types(features.dtype, torch.float32))
-        descriptor = features if whitening is None else whitening(features, self._projection)
+        shows = features.any(1, keepdim=True).to(features)
+        descriptor = features if whitening is None else whitening(features, self._projection) * shows
         check_shape(descriptor, f"{len(shifts)} {dimension}", "the frame gives features")
         expect(descriptor.isfinite().all(), "finite numbers", "the frame gives NaN or infinite features")
         return descriptor

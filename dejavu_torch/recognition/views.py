@@ -31,7 +31,7 @@ MORE = 0.03  # share of the queries where it has to do so more often with moved 
 CHANCE = 0.08  # share of the answers below which a view is left out; by chance each has one of thirteen
 FLAT = 0.02  # of the unit of scores: if those of all views differ less, they do not tell the shift
 WIDEST = 180  # degrees of a field of view
-MOST_PLACES = 2**17  # of a map on which shifts are measured
+MOST_PLACES = 2**15  # of a map on which shifts are measured
 
 
 @dataclass(frozen=True)
@@ -65,6 +65,13 @@ class Views:
         pairs = zip(self.shifts, self.penalties, strict=True)
         shifts, penalties = zip(*(pair for pair in pairs if pair[1] < math.inf), strict=True)
         return shifts, penalties
+
+    @property
+    def with_unmoved(self) -> Views:
+        """Those that answer, and the unmoved one: of images alone, any camera may have taken one."""
+        known = dict(zip(*self.known, strict=True))
+        known = {0.0: known.pop(0.0, START), **known}
+        return replace(self, shifts=tuple(known), penalties=tuple(known.values()))
 
     def of(self, traverse: Traverse) -> Traverse:
         """The copies of each frame."""
@@ -139,11 +146,13 @@ class BestView(BestOf):
     def told(self, queries: Tensor, places: Tensor) -> dict[str, Tensor]:
         shift = torch.full(places.shape, torch.nan)
         if self.layout.places <= MOST_PLACES:
-            every = (queries[:, None] * self.copies + torch.arange(self.copies)).flatten()
-            scores = self.scorer.rows(every) / self.unit
-            scores = scores.view(len(queries), self.copies, scores.shape[1])
-            at = places[:, None, :1].clamp(min=0).expand(-1, self.copies, -1)
-            shift[:, 0] = shift_of(scores.gather(2, at.to(scores.device))[..., 0].cpu(), self.shifts)
+            size = max(1, self.at_once // (self.copies * self.layout.places))
+            for part in torch.arange(len(queries)).split(size):
+                every = (queries[part, None] * self.copies + torch.arange(self.copies)).flatten()
+                scores = self.scorer.rows(every)
+                at = places[part, :1].clamp(min=0).repeat_interleave(self.copies, 0).to(scores.device)
+                own = scores.gather(1, at).view(len(part), self.copies).cpu() / self.unit
+                shift[part, 0] = shift_of(own, self.shifts)
         return {"shift": shift} | ({} if self.fov is None else {"shift_degrees": degrees(shift, self.fov)})
 
 
