@@ -577,7 +577,8 @@ class DejaVu(nn.Module):
             queries: as they are, described as the map's frames. ordered: one drive. centre: see `localize`.
         """
         images, learns = len(queries.frame_shape) == 3, ordered and len(queries) >= LEAST
-        views = self.views_at_first(querying, images and querying.headings == 1, learns)
+        images = images and querying.headings == 1 and querying.loops is None
+        views = self.views_at_first(querying, images, learns)
         if views == ALONE or querying.fov is not None or not isinstance(querying.shifts, str):
             return replace(querying, views=views)
         useful = views.known[0] != ALONE.shifts
