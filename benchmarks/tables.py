@@ -245,26 +245,21 @@ def views() -> str:
     table = [["mean AUC", "routes", *columns]]
     cases: list[tuple[str, str, float | None]] = [("as filmed", "default", None)]
     cases += [("as filmed, half a byte", "half a byte", None)]
-    cases += [
-        (f"cut, pointing {100 * shift:+.0f} % of the width aside", "default", shift) for shift in POINTED
-    ]
+    cases += [(f"cut, {100 * shift:+.0f} % of the width aside", "default", shift) for shift in POINTED]
     for name, rate, shift in cases:
-        rows = [row for row in read("views")["rows"] if row["rate"] == rate and row["auc"] is not None]
+        rows = [row for row in read("views")["rows"] if row["rate"] == rate and row.get("auc") is not None]
         if shift is None:
-            own = by("case", [row for row in rows if row["shift"] is None])
+            some = [row for row in rows if row.get("shift") is None]
         else:
-            some = [row for row in rows if row["shift"] is not None]
-            own = by("case", [row for row in some if abs(row["shift"] - shift) < POINTED_WITHIN])
+            cut = [row for row in rows if row.get("shift") is not None]
+            some = [row for row in cut if abs(row["shift"] - shift) < POINTED_WITHIN]
+        own = [[*pair] for _, pair in groupby(some, lambda row: row["case"])]
         cells = [str(len(own))]
         for key in ("auc_one", "auc"):
-            each = [
-                [{row["contender"]: row for row in pair}[way][key] for way in WAYS] for pair in own.values()
-            ]
+            each = [[{row["contender"]: row for row in pair}[way][key] for way in WAYS] for pair in own]
             cells += [area(mean(column)) for column in zip(*each, strict=True)]
             cells.append(f"{min(views - alone for alone, views in each):+.3f}")
-        errors = [
-            row["shift_error"] for pair in own.values() for row in pair if row["shift_error"] is not None
-        ]
+        errors = [row["shift_error"] for row in some if row.get("shift_error") is not None and shift]
         table.append([name, *cells, f"{100 * median(errors):.1f} %" if errors else ""])
     return markdown(table)
 

@@ -27,7 +27,7 @@ from dejavu_torch.types import InputError, Match, Traverse
 FOOTAGE = {name: one for name, one in EVERY.items() if one.features == "images"}
 CHOSEN = tuple(FOOTAGE)[::2]  # constants were chosen on these, and the others tried afterwards
 MARGIN = 0.2  # of the width that is cut off on either side, so that the second visit can show another part
-POINTED = (0.0, 0.1, -0.17, 0.24)  # of what is left: by how much the second camera points to the right
+POINTED = (0.0, 0.1, -0.17)  # of what is left: by how much the second camera points to the right
 POINTED_WITHIN = 0.03  # of these, in whole pixels
 RATES = {"default": None, "half a byte": 0.5}
 ASKED = 1000  # queries, from the middle
