@@ -25,14 +25,13 @@ from dejavu_torch.recognition.smoother import PlaceSmoother
 from dejavu_torch.types import InputError, Match, Traverse
 
 FOOTAGE = {name: one for name, one in EVERY.items() if one.features == "images"}
-CHOSEN = tuple(FOOTAGE)[::2]  # constants were chosen on these, and the others tried afterwards
 MARGIN = 0.2  # of the width that is cut off on either side, so that the second visit can show another part
 POINTED = (0.0, 0.1, -0.17)  # of what is left: by how much the second camera points to the right
 POINTED_WITHIN = 0.03  # of these, in whole pixels
 RATES = {"default": None, "half a byte": 0.5}
 ASKED = 1000  # queries, from the middle
 WAYS: tuple[Literal["none", "auto"], ...] = ("none", "auto")
-KEYS = ("rate", "half", "shift", "views", "auc_one", "auc", "error", "shift_error", "ms", "missed")
+KEYS = ("rate", "shift", "views", "auc_one", "auc", "error", "shift_error", "ms", "missed")
 
 
 def pointed(reference: Traverse, query: Traverse, shift: float) -> tuple[Traverse, Traverse, float]:
@@ -65,8 +64,7 @@ def bench_views(name: str, data: Path, rate: str, shift: float | None) -> Iterat
     some = range(first, min(len(query), first + ASKED))
     query, truth = Part(query, some), GroundTruth(*(column[some.start : some.stop] for column in truth))
     model = DejaVu(mapper=SpectralMapper(RATES[rate]))
-    half = "chosen on" if name in CHOSEN else "reported"
-    row = new_row(name, "none", KEYS, rate=rate, half=half, shift=known)
+    row = new_row(name, "none", KEYS, rate=rate, shift=known)
     try:
         model.learn(reference)
     except InputError as error:

@@ -40,7 +40,7 @@ from dejavu_torch.recognition.scorer import OfMap, Scorer
 from dejavu_torch.recognition.search import Scan, Search, Searcher, check_search
 from dejavu_torch.recognition.select import HIGHEST, PROBABLE, Acceptance, check_candidates
 from dejavu_torch.recognition.smoother import PlaceSmoother
-from dejavu_torch.recognition.views import ALONE, FIRST, LEAST, SHIFTS, BestView, Views
+from dejavu_torch.recognition.views import ALONE, FIRST, LEAST, Views
 from dejavu_torch.resize import reduced_size
 from dejavu_torch.types import Facts, InputError, Match, SequenceModel, Traverse, expect
 
@@ -504,7 +504,8 @@ class DejaVu(nn.Module):
         apart: int = 5,
     ) -> Iterator[Match]:
         """As `localize`, with `top` as `candidates`, or as `loops`: one batch of queries at a time, in
-        constant memory, or after the descriptors of all with a smoother, centred queries or headings."""
+        constant memory, or after the descriptors of all with a smoother, centred queries, headings, or views
+        that single images in order have to show."""
         require_map(self)
         if querying.top is not None:
             check_candidates(querying.top, apart, self.map.places)
@@ -582,25 +583,24 @@ class DejaVu(nn.Module):
         if views == ALONE or querying.fov is not None or not isinstance(querying.shifts, str):
             return replace(querying, views=views)
         useful = views.known[0] != ALONE.shifts
-        if learns:
-            first = Part(queries, range(min(FIRST, len(queries))))
-            rows = self.descriptor.all_of(views.of(first))
-            best = views(self.scorer(centred(self.map, rows, len(SHIFTS)) if centre else rows))
-            useful |= isinstance(best, BestView) and best.kept.tolist() != [0]
+        useful |= learns and self._shown(queries, views, centre).known[0] != ALONE.shifts
         return replace(querying, views=views if useful else ALONE)
+
+    def _shown(self, drive: Traverse, views: Views, centre: bool) -> Views:
+        """The views with the penalties that the first queries of a drive tell."""
+        first = Part(drive, range(min(FIRST, len(drive))))
+        rows = self.descriptor.all_of(views.of(first))
+        rows = centred(self.map, rows, len(views.shifts)) if centre else rows
+        return views.learned(self.scorer(rows))
 
     def look_at(self, visit: Traverse | AugmentedFrames) -> DejaVu:
         """Let single images be compared with the views that another visit, in order, shows to be of use."""
         drive = hasattr(visit, "layout") and self.views is None  # copies of frames lie nowhere
         if drive and len(visit) >= LEAST and self.descriptor.fits(self.map.dimension, visit):
-            first = Part(cast(Traverse, visit), range(min(FIRST, len(visit))))
-            centres = self.centres(len(first))
-            querying = self.looking(first, QUERYING, True, centres)
-            if querying.views != ALONE:
-                rows = self.descriptor.all_of(querying.views.of(first))
-                rows = centred(self.map, rows, querying.copies) if centres else rows
-                known = querying.views.learned(self.scorer(rows)).with_unmoved
-                self.views = None if known.shifts == ALONE.shifts else known
+            views = self.views_at_first(QUERYING, len(visit.frame_shape) == 3, True)
+            if views != ALONE:
+                shown = self._shown(cast(Traverse, visit), views, self.centres(min(FIRST, len(visit))))
+                self.views = shown.with_unmoved if shown.known[0] != ALONE.shifts else None
         return self
 
     def centres(self, queries: int) -> bool:

@@ -100,19 +100,9 @@ def write_matches(
             route, at = layout.route_of(match.index), layout.coordinates(match.index)
             whole = queries.repeat_interleave(each), places, own, match.accepted, rank, route
             parts = match.score, right, sure, turn, aside, by, *at.unbind(1)
-            for (query, place, number, good, order, on), (
-                score,
-                chance,
-                margin,
-                north,
-                shift,
-                by,
-                x,
-                y,
-            ) in zip(
-                *(zip(*(column.tolist() for column in columns), strict=True) for columns in (whole, parts)),
-                strict=True,
-            ):
+            rows = (zip(*(one.tolist() for one in columns), strict=True) for columns in (whole, parts))
+            for (query, place, number, good, order, on), own in zip(*rows, strict=True):
+                score, chance, margin, north, shift, by, x, y = own
                 row = {
                     "query": query,
                     "place": number,

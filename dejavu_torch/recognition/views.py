@@ -22,7 +22,7 @@ from dejavu_torch.types import Match, Traverse, expect
 
 SHIFTS = (0.0, *(sign * round(0.04 * k, 2) for k in range(1, 7) for sign in (1, -1)))  # of the width
 FIRST, LEAST = 100, 40  # queries that penalties are learned from; fewer do not tell
-# Constants of penalties: chosen on every second route of `benchmarks views`, checked on the others.
+# Constants of penalties: chosen on all routes of `benchmarks views`, with drives over other ground.
 SURE, ROUNDS = 1 / 3, 4  # share of the answers that tell, the surest; times that they are asked
 START, NATS = 0.08, 0.04  # first penalty of a moved view, and for each nat by which it is rarer
 AS_IT_IS, OTHER = 2.0, 0.3  # answers by the unmoved view, and by each other, that are taken for granted
