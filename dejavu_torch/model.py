@@ -32,15 +32,16 @@ from dejavu_torch.maps.weights import BITS, round_weights
 from dejavu_torch.motion.odometry import GroundOdometry
 from dejavu_torch.motion.resampling import ResampledTraverse, resampled, source_of
 from dejavu_torch.places.layout import ROUTE, Layout
+from dejavu_torch.recognition.calibration import confidence
 from dejavu_torch.recognition.centring import PRIOR, centred, set_apart
 from dejavu_torch.recognition.coarse import searcher
 from dejavu_torch.recognition.localizer import SINGLE, Localizer, Matching, answer
 from dejavu_torch.recognition.querying import QUERYING, Querying, Sequences
-from dejavu_torch.recognition.scorer import OfMap, Scorer
+from dejavu_torch.recognition.scorer import Earlier, OfMap, Scorer
 from dejavu_torch.recognition.search import Scan, Search, Searcher, check_search
 from dejavu_torch.recognition.select import HIGHEST, PROBABLE, Acceptance, check_candidates
 from dejavu_torch.recognition.smoother import PlaceSmoother
-from dejavu_torch.recognition.views import ALONE, FIRST, LEAST, Views
+from dejavu_torch.recognition.views import ALONE, FIRST, LEAST, Views, best_pairs
 from dejavu_torch.resize import reduced_size
 from dejavu_torch.types import Facts, InputError, Match, SequenceModel, Traverse, expect
 
@@ -443,32 +444,30 @@ class DejaVu(nn.Module):
         """The scores of descriptors (Q,K) at the places of the map, to be matched so."""
         return OfMap(self.map, descriptors, self._searcher(matching))
 
-    def loops(self, traverse: Source, apart: int = 50, drive: bool = True, progress: bool = False) -> Match:
+    def loops(
+        self,
+        traverse: Source,
+        apart: int = 50,
+        drive: bool = True,
+        progress: bool = False,
+        shifts: Literal["auto", "none"] | Sequence[float] = "auto",
+    ) -> Match:
         """Where a drive comes back to places that it has passed before: the best earlier place of each frame.
 
         Args:
             traverse: what the map was learned from. apart: frames before a frame that are no answers, nor
                 those after it: each pair counts once.
-            drive: the frames are in order, and the whole drive has to agree.
+            drive: the frames are in order, and the whole drive has to agree. shifts: see `localize`.
 
         Shape: -> Match of (N,) on the CPU; index -1 for the first frames.
 
         Raises:
             InputError: another traverse than the map's, or `apart` out of range.
         """
-        require_map(self)
-        check_loops_along(self.map.layout)
-        traverse = self.at_map_size(as_traverse(traverse), self.frame_shape or ())
-        if self.step is not None:
-            traverse = self.resample(traverse, self.step, progress, self.frame_shape)
-        seen = f"{traverse.name} has {len(traverse)} places, the map {self.map.places}"
-        expect(len(traverse) == self.map.places, "the traverse that the map was learned from", seen)
-        check_apart(apart, len(traverse))
-        descriptors = self.descriptor.all_of(traverse, progress)
-        matching = self.loop_matching(apart, PlaceSmoother() if drive else None)
-        return self.localize_descriptors(descriptors, matching, progress=progress)
+        querying = _querying(PlaceSmoother() if drive else None, None, 1, shifts)
+        return Match.joined(self.matches(traverse, replace(querying, loops=apart), progress))
 
-    def loop_matching(self, apart: int, smoother: PlaceSmoother | None) -> Matching:
+    def loop_matching(self, apart: int, smoother: SequenceModel | None) -> Matching:
         """How `loops` matches. Answers are accepted as of single queries, or if a drive finds them likely."""
         single = self.matching(None)
         drive = single if smoother is None else self.matching(smoother)
@@ -515,19 +514,24 @@ class DejaVu(nn.Module):
         if sequence == "auto":
             sequence = querying.matcher(ordered=queries.ordered if ordered is None else ordered)
         assert not isinstance(sequence, str)
-        if querying.loops is not None:
-            yield self.loops(queries, querying.loops, sequence is not None and sequence.whole, progress)
-            return
+        loops = querying.loops
+        if loops is not None:
+            check_loops_along(self.map.layout)
         queries = self.at_map_size(queries, self.frame_shape or ())
-        matching = self.matching(sequence, search)
+        matching = self.matching(sequence, search) if loops is None else self.loop_matching(loops, sequence)
         self._searcher(matching)  # refuses what does not fit
         if sequence is not None:
             sequence.check(len(queries), self.map.places)
         if self.step is not None:
             queries = self.resample(queries, self.step, progress, self.frame_shape)
+        if loops is not None:
+            seen = f"{queries.name} has {len(queries)} places, the map {self.map.places}"
+            expect(len(queries) == self.map.places, "the traverse that the map was learned from", seen)
+            check_apart(loops, len(queries))
         ordered = queries.ordered or sequence is not None if ordered is None else ordered
         whole = sequence is not None and sequence.whole
-        centres = querying.centres(whole and self.centres(len(queries))) and (whole or sequence is None)
+        centres = loops is None and querying.centres(whole and self.centres(len(queries)))
+        centres &= whole or sequence is None
         querying = self.looking(queries, querying, ordered, centres)
         matching = matching._replace(k=querying.top, radius=apart, wrappers=querying.wrappers)
         count, queries = len(queries), querying.copies_of(queries, self.map.layout)
@@ -539,7 +543,8 @@ class DejaVu(nn.Module):
 
         turned = isinstance(queries, Turned)
         learns = querying.views.learns and sequence is None  # of single images: from those after them, too
-        if not (whole or (querying.centres(False) and not turned) or headings > 1 or learns):
+        together = whole or loops is not None or headings > 1 or learns
+        if not (together or (querying.centres(False) and not turned)):
             localizer = self.localizer(matching.as_it_drives())
             batches = self.descriptor.batches(queries, progress, "localizing", on_first)
             yield from map(localizer, (set_apart(self.map, rows) if turned else rows for rows in batches))
@@ -578,20 +583,30 @@ class DejaVu(nn.Module):
             queries: as they are, described as the map's frames. ordered: one drive. centre: see `localize`.
         """
         images, learns = len(queries.frame_shape) == 3, ordered and len(queries) >= LEAST
-        images = images and querying.headings == 1 and querying.loops is None
-        views = self.views_at_first(querying, images, learns)
-        if views == ALONE or querying.fov is not None or not isinstance(querying.shifts, str):
+        views, loops = (
+            self.views_at_first(querying, images and querying.headings == 1, learns),
+            querying.loops,
+        )
+        given = querying.fov is not None or not isinstance(querying.shifts, str)
+        if views == ALONE or (given and loops is None):
             return replace(querying, views=views)
-        useful = views.known[0] != ALONE.shifts
-        useful |= learns and self._shown(queries, views, centre).known[0] != ALONE.shifts
+        shown = self._shown(queries, views, centre, loops) if learns else views
+        views = views if loops is None else shown  # which knows which queries have come back
+        useful = given or {*views.known[0], *shown.known[0]} != {*ALONE.shifts}
         return replace(querying, views=views if useful else ALONE)
 
-    def _shown(self, drive: Traverse, views: Views, centre: bool) -> Views:
-        """The views with the penalties that the first queries of a drive tell."""
-        first = Part(drive, range(min(FIRST, len(drive))))
-        rows = self.descriptor.all_of(views.of(first))
-        rows = centred(self.map, rows, len(views.shifts)) if centre else rows
-        return views.learned(self.scorer(rows))
+    def _shown(self, drive: Traverse, views: Views, centre: bool, loops: int | None = None) -> Views:
+        """The views with the penalties that the first queries of a drive tell, or, of its loops, those that
+        surely have come back."""
+        first, count, copies = 0, min(FIRST, len(drive)), len(views.shifts)
+        if loops is not None:
+            alone = Earlier(self.scorer(self.descriptor.all_of(drive)), loops)
+            sure = confidence(best_pairs(alone, 1, len(drive))).nan_to_num(0, -1e3, -1e3)
+            first = int(sure.unfold(0, count, 1).mean(1).argmax())
+        rows = self.descriptor.all_of(views.of(Part(drive, range(first, first + count))))
+        rows = centred(self.map, rows, copies) if centre else rows
+        scorer = self.scorer(rows)
+        return views.learned(scorer if loops is None else Earlier(scorer, loops, first, copies))
 
     def look_at(self, visit: Traverse | AugmentedFrames) -> DejaVu:
         """Let single images be compared with the views that another visit, in order, shows to be of use."""

@@ -58,6 +58,7 @@ from dejavu_torch.recognition.querying import QUERYING, Querying
 from dejavu_torch.recognition.scorer import Repeated, Scorer
 from dejavu_torch.recognition.select import check_candidates
 from dejavu_torch.recognition.smoother import PlaceSmoother
+from dejavu_torch.recognition.views import ALONE
 from dejavu_torch.types import Facts, InputError, Match, SequenceModel, Traverse, expect
 
 log = logging.getLogger("dejavu_torch")
@@ -334,7 +335,7 @@ def _answered(plan: Plan, run: Localization) -> tuple[Localization, Match, Match
         return answer(scorer, own, progress)
 
     with timed(plan.seconds, "localize"):
-        if run.query is not run.reference:
+        if run.query is not run.reference or querying.views != ALONE:
             run = run._replace(query_features=run.described_by(model, progress))
         queries, way = run.query_features, matching.sequence
         if plan.centring and not isinstance(run.asked, Turned):

@@ -106,6 +106,10 @@ class PlaceMap(nn.Module, ABC):
         """The columns of `scores`, block by block."""
         yield 0, self.scores(queries)
 
+    def scores_at(self, queries: Tensor, places: Tensor) -> Tensor:
+        """The columns of `scores` at some places of each query, (Q,K), (Q,M) -> (Q,M)."""
+        return self.scores(queries).gather(1, places)
+
     @property
     def block_places(self) -> int:
         """About how many numbers the largest block of `score_blocks` needs per query."""

@@ -480,6 +480,19 @@ class SpectralMap(PlaceMap):
             queries = (queries * self.stage_scale.to(queries)) @ self.stage.to(queries).T
         return self._all_products(queries, chunks)
 
+    def products_at(self, queries: Tensor, places: Tensor) -> Tensor:
+        """As `products`, at some places of each query, -inf at those below 0: (Q,K), (Q,M) -> (Q,M)."""
+        found = torch.full(places.shape, -math.inf, dtype=torch.float32, device=places.device)
+        starts = torch.tensor([start for start, _ in self.chunks], device=places.device)
+        chunk = torch.bucketize(places, starts, right=True) - 1
+        for g in chunk.unique().tolist():
+            if g >= 0:
+                query, column = (chunk == g).nonzero().T
+                some, row = query.unique_consecutive(return_inverse=True)
+                here = self.products(queries[some], range(g, g + 1))
+                found[query, column] = here[row, places[query, column] - self.chunks[g][0]]
+        return found
+
     def _all_products(self, queries: Tensor, chunks: range) -> Tensor:
         """As `products`, without the stage."""
         parts = [queries]
@@ -529,15 +542,10 @@ class SpectralMap(PlaceMap):
 
     def score_blocks(self, queries: Tensor) -> ScoreBlocks:
         """See `PlaceMap`: blocks of consecutive chunks that fit into the processor's cache."""
-        self.check_queries(queries)
-        queries = queries.to(torch.promote_types(queries.dtype, torch.float32))
+        queries, length = self._asked(queries)
         if not queries.shape[0]:  # of which MKL has no transform
             yield 0, queries.new_zeros(0, self.places)
             return
-        queries = self.staged(queries)
-        length: Tensor = torch.linalg.vector_norm(queries, dim=1, keepdim=True)
-        if self.metric == "cosine":
-            queries = queries / torch.where(length > 0, length, 1)
         rows = self.dimension
         if not torch.compiler.is_compiling():  # a compiled program has the same blocks for any Q
             rows = max(1, queries.shape[0] + len(self.level) // max(1, self.places))
@@ -545,6 +553,17 @@ class SpectralMap(PlaceMap):
             start, stop = self.chunks[run.start][0], self.chunks[run.stop - 1][1]
             products = self.products(queries, run)
             yield start, scores_of(products, self.norms[start:stop], length, self.metric)
+
+    def scores_at(self, queries: Tensor, places: Tensor) -> Tensor:
+        queries, length = self._asked(queries)
+        return scores_of(self.products_at(queries, places), self.norms[places], length, self.metric)
+
+    def _asked(self, queries: Tensor) -> tuple[Tensor, Tensor]:
+        """Staged queries, by cosine of length 1, and their lengths (Q,1)."""
+        self.check_queries(queries)
+        queries = self.staged(queries.to(torch.promote_types(queries.dtype, torch.float32)))
+        length: Tensor = torch.linalg.vector_norm(queries, dim=1, keepdim=True)
+        return queries / torch.where(length > 0, length, 1) if self.metric == "cosine" else queries, length
 
     @property
     def block_places(self) -> int:

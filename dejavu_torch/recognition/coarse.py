@@ -175,7 +175,6 @@ class CoarseSearch(Scan):
     def __init__(self, place_map: SpectralMap, chosen: SamplingPlan) -> None:
         super().__init__(place_map)
         self.plan = chosen
-        self.starts = torch.tensor([start for start, _ in place_map.chunks], device=place_map.norms.device)
         self.fine, self.coarse = Samples(place_map, chosen.fine), Samples(place_map, chosen.coarse)
         self.middle = torch.searchsorted(self.fine.place, self.coarse.place, out_int32=True)
 
@@ -238,14 +237,7 @@ class CoarseSearch(Scan):
             cosines = self.fine.cosines(units, place.clamp(min=0))
             seen = self.place_map.norms[place].isfinite() & (place >= 0)
             return torch.where(seen, 1 - cosines, math.inf)
-        products = torch.full(place.shape, -math.inf, dtype=torch.float32, device=place.device)
-        chunk = torch.bucketize(place, self.starts, right=True) - 1
-        for g in chunk.unique().tolist():
-            if g >= 0:
-                query, column = (chunk == g).nonzero().T
-                queries, row = query.unique_consecutive(return_inverse=True)
-                here = self.place_map.products(units[queries], range(g, g + 1))
-                products[query, column] = here[row, place[query, column] - self.place_map.chunks[g][0]]
+        products = self.place_map.products_at(units, place)
         norms = self.place_map.norms[place].masked_fill(place < 0, 1)
         return scores_of(products, norms, norms, "cosine")
 

@@ -156,8 +156,7 @@ class Querying(Sequences):
         if self.loops is not None:
             together = self.way not in (None, "drive", "single") and self.way
             own = {"centre": self.centre, "top": self.top, "headings": self.headings != 1 and self.headings}
-            given = {"shifts": not isinstance(self.shifts, str) and self.shifts, "fov": self.fov}
-            refuse_with(f"--loops {self.loops}", match=together, **own, **given, **others)
+            refuse_with(f"--loops {self.loops}", match=together, **own, **others)
 
 
 SEQUENCES = Sequences()

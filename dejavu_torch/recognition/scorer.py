@@ -83,6 +83,11 @@ class Scorer(ABC):
     def rows(self, queries: Tensor) -> Tensor:
         """Scores of queries by their numbers, (B,) int64 -> (B,N)."""
 
+    def at(self, queries: Tensor, places: Tensor) -> Tensor:
+        """Scores of queries at some places of each, (B,), (B,k) -> (B,k)."""
+        scores = self.rows(queries)
+        return scores.gather(1, places.to(scores.device))
+
     def blocks(self, queries: Tensor) -> ScoreBlocks:
         """The columns of `rows`, block by block."""
         yield 0, self.rows(queries)
@@ -172,6 +177,9 @@ class OfMap(Scorer):
 
     def rows(self, queries: Tensor) -> Tensor:
         return self.place_map.scores(self._asked(queries))
+
+    def at(self, queries: Tensor, places: Tensor) -> Tensor:
+        return self.place_map.scores_at(self._asked(queries), places.to(self.place_map.device))
 
     def blocks(self, queries: Tensor) -> ScoreBlocks:
         return self.place_map.score_blocks(self._asked(queries))
@@ -285,24 +293,28 @@ class Reordered(Wrapped):
     def changed(self, scores: Tensor, queries: Tensor) -> Tensor:
         return scores[:, self.place.to(scores.device)]
 
+    def at(self, queries: Tensor, places: Tensor) -> Tensor:
+        return self.scorer.at(queries, self.place.to(places.device)[places])
+
     def told(self, queries: Tensor, places: Tensor) -> dict[str, Tensor]:
         return self.scorer.told(queries, self.place.to(places.device)[places.clamp(min=0)])
 
 
 class Earlier(Wrapped):
-    """Queries are the places themselves: only those over `apart` before a query answer; blank ones find
-    nothing. Where ground repeats, as lane dashes do, a drive alone finds loops that are none."""
+    """Queries are the places themselves, from `first` on, or so many copies of each: only places over `apart`
+    before one answer; blank ones find nothing. Where ground repeats, as lane dashes do, a drive alone finds
+    loops that are none."""
 
     null, least = None, 0.0
 
-    def __init__(self, scorer: Scorer, apart: int) -> None:
+    def __init__(self, scorer: Scorer, apart: int, first: int = 0, copies: int = 1) -> None:
         super().__init__(scorer)
-        self.apart, self.checks = apart, True
+        self.apart, self.first, self.each, self.checks = apart, first, copies, True
 
     def changed(self, scores: Tensor, queries: Tensor) -> Tensor:
         blank = ~self.descriptors[queries.to(self.descriptors.device)].any(1, keepdim=True)
         place = torch.arange(scores.shape[1], device=scores.device)
-        closed = place >= (queries[:, None] - self.apart).to(scores.device)
+        closed = place >= (self.first + queries[:, None] // self.each - self.apart).to(scores.device)
         return scores.masked_fill(closed | blank.to(scores.device), math.inf)
 
 
@@ -356,9 +368,9 @@ class BestOf(Wrapped):
 
     def copy_at(self, queries: Tensor, places: Tensor) -> Tensor:
         """Which copy of each query answers at places, (B,), (B,k) -> (B,k)."""
-        scores = self._each(self.scorer.rows(self.asked(queries)), queries)
-        at = places.clamp(min=0)[:, None].expand(-1, len(self.kept), -1).to(scores.device)
-        return self.kept[scores.gather(2, at).argmin(1).cpu()]
+        places = places.clamp(min=0).repeat_interleave(len(self.kept), 0)
+        scores = self._each(self.scorer.at(self.asked(queries), places), queries)
+        return self.kept[scores.argmin(1).cpu()]
 
     def _each(self, scores: Tensor, queries: Tensor) -> Tensor:
         """The scores of each copy of queries, with its penalty: (B x V,n) -> (B,V,n)."""
@@ -381,39 +393,11 @@ class Repeated(Wrapped):
 
 
 class BestHeading(BestOf):
-    """As `BestOf`, of evenly turned copies, with the heading of the one that answers. What was scored last is
-    kept until that is known."""
-
-    def __init__(self, scorer: Scorer, copies: int) -> None:
-        super().__init__(scorer, copies)
-        self.last: tuple[Tensor, Tensor, Tensor | None] | None = None
-
-    def rows(self, queries: Tensor) -> Tensor:
-        scores = self.scorer.rows(self.asked(queries))
-        self.last = (queries, scores, None) if scores.numel() <= SCORES_AT_ONCE else None
-        return self.changed(scores, queries)
-
-    def best(self, queries: Tensor, wanted: Wanted) -> Lowest:
-        scores, places = self.scorer.best(self.asked(queries), wanted)
-        self.last = queries, scores, places
-        if places is None:
-            return self.changed(scores, queries), None
-        return scores.view(len(queries), -1), places.view(len(queries), -1)
+    """As `BestOf`, of evenly turned copies, with the heading of the one that answers."""
 
     def told(self, queries: Tensor, places: Tensor) -> dict[str, Tensor]:
-        turn = self.copy_at(queries, places).cpu() * (360 / self.copies)
+        turn = self.copy_at(queries, places) * (360 / self.copies)
         return {"heading": ((turn - self.layout.north) % 360).float()}
-
-    def copy_at(self, queries: Tensor, places: Tensor) -> Tensor:
-        if self.last is None or self.last[0] is not queries:
-            return super().copy_at(queries, places)
-        _, scores, known = self.last
-        if known is None:
-            at = places.clamp(min=0)[:, None].expand(-1, self.copies, -1).to(scores.device)
-            return scores.view(-1, self.copies, self.layout.places).gather(2, at).argmin(1)
-        each, (scores, known) = scores.shape[1], (one.view(len(queries), -1) for one in (scores, known))
-        other = known[:, None] != places[..., None].to(known.device)
-        return scores[:, None].expand_as(other).masked_fill(other, math.inf).argmin(2) // each
 
 
 class Cached(Wrapped):

@@ -31,7 +31,6 @@ MORE = 0.03  # share of the queries where it has to do so more often with moved 
 CHANCE = 0.08  # share of the answers below which a view is left out; by chance each has one of thirteen
 FLAT = 0.02  # of the unit of scores: if those of all views differ less, they do not tell the shift
 WIDEST = 180  # degrees of a field of view
-MOST_PLACES = 2**15  # of a map on which shifts are measured
 
 
 @dataclass(frozen=True)
@@ -145,14 +144,10 @@ class BestView(BestOf):
 
     def told(self, queries: Tensor, places: Tensor) -> dict[str, Tensor]:
         shift = torch.full(places.shape, torch.nan)
-        if self.layout.places <= MOST_PLACES:
-            size = max(1, self.at_once // (self.copies * self.layout.places))
-            for part in torch.arange(len(queries)).split(size):
-                every = (queries[part, None] * self.copies + torch.arange(self.copies)).flatten()
-                scores = self.scorer.rows(every)
-                at = places[part, :1].clamp(min=0).repeat_interleave(self.copies, 0).to(scores.device)
-                own = scores.gather(1, at).view(len(part), self.copies).cpu() / self.unit
-                shift[part, 0] = shift_of(own, self.shifts)
+        every = (queries[:, None] * self.copies + torch.arange(self.copies)).flatten()
+        at = places[:, :1].clamp(min=0).repeat_interleave(self.copies, 0)
+        scores = self.scorer.at(every, at).view(len(queries), self.copies).cpu() / self.unit
+        shift[:, 0] = shift_of(scores, self.shifts)
         return {"shift": shift} | ({} if self.fov is None else {"shift_degrees": degrees(shift, self.fov)})
 
 

@@ -137,18 +137,6 @@ def test_a_wrapper_changes_what_a_model_finds():
     assert torch.equal(several.index, model.localize_descriptors(queries, Matching(k=3, radius=5)).index)
 
 
-def test_what_was_scored_last_is_not_kept_of_a_whole_flight(monkeypatch):
-    scores, every = noise(60, 7), torch.arange(30)
-    scorer = BestHeading(OfRows(scores.__getitem__, noise(60, 3), Layout(7)), 2)
-    places = scorer.rows(every).argmin(1, keepdim=True)
-    assert scorer.last is not None
-    known = scorer.told(every, places)["heading"]
-    monkeypatch.setattr("dejavu_torch.recognition.scorer.SCORES_AT_ONCE", 60 * 7 - 1)
-    scorer.rows(every)
-    assert scorer.last is None
-    assert torch.equal(scorer.told(every, places)["heading"], known)
-
-
 def test_no_queries_have_no_headings(place_map):
     for sequence in (None, PlaceFilter(), PlaceSmoother()):
         match = answer(OfMap(place_map, noise(0, 6)), Matching(sequence, wrappers=TWO))
