@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
+import torch
 from tqdm import tqdm
 
 from benchmarks.cross import FOOTAGE as EVERY
@@ -20,8 +23,11 @@ from dejavu_torch.evaluation.rejection import calibration_error, judged
 from dejavu_torch.growth import calibrate_if_possible
 from dejavu_torch.maps.spectral import SpectralMapper
 from dejavu_torch.model import DejaVu
+from dejavu_torch.recognition.localizer import answer
 from dejavu_torch.recognition.querying import Querying
+from dejavu_torch.recognition.scorer import BestOf
 from dejavu_torch.recognition.smoother import PlaceSmoother
+from dejavu_torch.recognition.views import ALONE, APART, FIRST, Views, best_pairs, evenly, penalties_of
 from dejavu_torch.types import InputError, Match, Traverse
 
 FOOTAGE = {name: one for name, one in EVERY.items() if one.features == "images"}
@@ -30,6 +36,14 @@ POINTED = (0.0, 0.1, -0.17)  # of what is left: by how much the second camera po
 POINTED_WITHIN = 0.03  # of these, in whole pixels
 RATES = {"default": None, "half a byte": 0.5}
 ASKED = 1000  # queries, from the middle
+STEPS = (0.02, APART, 0.08)  # between views, in shares of the width
+SETTINGS: dict[str, dict[str, float]] = {
+    "as it is": {},
+    **{f"start {value:g}": {"start": value} for value in (0.04, 0.16)},
+    **{f"{value:g} a nat": {"nats": value} for value in (0.02, 0.08)},
+    **{f"share above {value:g}": {"chance": value} for value in (0.02, 0.05, 0.12)},
+    **{f"{value:g} more follow": {"more": value} for value in (0.0, 0.06)},
+}
 WAYS: tuple[Literal["none", "auto"], ...] = ("none", "auto")
 KEYS = ("rate", "shift", "views", "auc_one", "auc", "error", "shift_error", "ms", "missed")
 
@@ -43,6 +57,31 @@ def pointed(reference: Traverse, query: Traverse, shift: float) -> tuple[Travers
     return Cropped(reference, (0, 0, margin, margin)), cut, aside / (query.frame_shape[2] - 2 * other)
 
 
+class Case(NamedTuple):
+    """A map, a second visit of its route, and how far its camera points to the right, None if as filmed."""
+
+    model: DejaVu
+    query: Traverse
+    truth: GroundTruth
+    tolerance: int
+    shift: float | None
+
+
+def case_of(name: str, data: Path, rate: str = "default", shift: float | None = None) -> Case:
+    """The case of a route; InputError if there is no map in so few bytes."""
+    one = FOOTAGE[name]
+    reference, query = (open_source(source.format(data=data)) for source in (one.reference, one.query))
+    truth, known = truth_of(reference, query, one.truth and one.truth.format(data=data)), None
+    if shift is not None:
+        reference, query, known = pointed(reference, query, shift)
+    first = max(0, len(query) - ASKED) // 2
+    some = range(first, min(len(query), first + ASKED))
+    query, truth = Part(query, some), GroundTruth(*(column[some.start : some.stop] for column in truth))
+    model = DejaVu(mapper=SpectralMapper(RATES[rate])).learn(reference)
+    calibrate_if_possible(model, reference)
+    return Case(model, query, truth, one.tolerance, known)
+
+
 def bench_views(name: str, data: Path, rate: str, shift: float | None) -> Iterator[Row]:
     """A row for each way on the map of a route.
 
@@ -54,37 +93,52 @@ def bench_views(name: str, data: Path, rate: str, shift: float | None) -> Iterat
         probabilities of single images. views: that answer. shift, shift_error: known, and median. ms: of
         processor time for a query, describing included. missed: why there is no map.
     """
-    one = FOOTAGE[name]
-    reference, query = (open_source(source.format(data=data)) for source in (one.reference, one.query))
-    truth = truth_of(reference, query, one.truth and one.truth.format(data=data))
-    known = None
-    if shift is not None:
-        reference, query, known = pointed(reference, query, shift)
-    first = max(0, len(query) - ASKED) // 2
-    some = range(first, min(len(query), first + ASKED))
-    query, truth = Part(query, some), GroundTruth(*(column[some.start : some.stop] for column in truth))
-    model = DejaVu(mapper=SpectralMapper(RATES[rate]))
-    row = new_row(name, "none", KEYS, rate=rate, shift=known)
+    row = new_row(name, "none", KEYS, rate=rate, shift=shift)
     try:
-        model.learn(reference)
+        model, query, truth, tolerance, known = case_of(name, data, rate, shift)
     except InputError as error:
         yield row | {"missed": str(error)}
         return
-    calibrate_if_possible(model, reference)
+    row["shift"] = known
     for way in WAYS:
         asked = Querying(ordered=True, shifts=way)
         began = time.process_time()
-        drive = _all(model, query, replace(asked, match=PlaceSmoother(within=max(1, one.tolerance))))
+        drive = _all(model, query, replace(asked, match=PlaceSmoother(within=max(1, tolerance))))
         passed = 1000 * (time.process_time() - began) / len(query)
         centre: Literal["mean", "none"] = "mean" if model.centres(len(query)) else "none"
         alone = _all(model, query, replace(asked, match="single", centre=centre))
-        figures: dict[str, Any] = {"auc_one": area(curve_of(by_confidence(alone), truth, one.tolerance))}
-        figures |= {"auc": evaluate(drive, truth, one.tolerance).auc, "ms": passed}
+        figures: dict[str, Any] = {"auc_one": area(curve_of(by_confidence(alone), truth, tolerance))}
+        figures |= {"auc": evaluate(drive, truth, tolerance).auc, "ms": passed}
         if alone.probability is not None:
-            figures["error"] = calibration_error(*judged(alone, truth, max(1, one.tolerance)))
+            figures["error"] = calibration_error(*judged(alone, truth, max(1, tolerance)))
         if drive.shift is not None and known is not None:
             figures["shift_error"] = float((drive.shift - known).abs().nanmedian())
         yield row | {"contender": way, "views": drive.shift is not None} | figures
+
+
+def bench_settings(name: str, data: Path, shift: float | None) -> Iterator[Row]:
+    """A row for each of the settings of penalties, and for each step between views, on the map of a route:
+    AUC of single images in order, by confidence, and the processor time of a query, describing included."""
+    model, query, truth, tolerance, known = case_of(name, data, shift=shift)
+    if model.views_at_first(Querying(), True, True) == ALONE:  # no views are of use
+        return
+    for apart in STEPS:
+        views = Views(evenly(apart), (0.0,) * len(evenly(apart)))
+        began = time.process_time()
+        rows = model.described(query, Querying(views=views), model.centres(len(query)))
+        scorer, copies = model.scorer(rows), len(views.shifts)
+        pairs = best_pairs(scorer, copies, min(FIRST, len(query)))
+        for setting, given in SETTINGS.items() if apart == APART else [("as it is", {})]:
+            penalties = penalties_of(pairs, scorer.layout, **given)
+            match = answer(BestOf(scorer, copies, penalties))
+            passed = 1000 * (time.process_time() - began) / len(query)
+            own = f"steps of {apart:g}" if setting == "as it is" else setting
+            figures = {"auc_one": area(curve_of(by_confidence(match), truth, tolerance)), "ms": passed}
+            yield new_row(name, own, KEYS, rate="default", shift=known) | figures
+            began = time.process_time()
+    alone = answer(BestOf(scorer, copies, torch.full((copies,), math.inf).index_fill(0, torch.tensor(0), 0)))
+    figures = {"auc_one": area(curve_of(by_confidence(alone), truth, tolerance))}
+    yield new_row(name, "none", KEYS, rate="default", shift=known) | figures
 
 
 def _all(model: DejaVu, query: Traverse, querying: Querying) -> Match:
@@ -97,13 +151,14 @@ COLUMNS: dict[str, Column] = {
 }
 
 
-def run_views(data: Path, *, out: Path, routes: Sequence[str] = ()) -> list[str]:
+def run_views(data: Path, *, out: Path, routes: Sequence[str] = (), choose: bool = False) -> list[str]:
     """Images compared as they are and moved sideways: AUC of one image and of the whole drive, and the shift.
 
     Args:
         data: folder of the footage, as for the tests
         out: folder for bench.json
         routes: names of routes; all if not given
+        choose: instead, steps between views and the constants of penalties
     """
     if unknown := [name for name in routes if name not in FOOTAGE]:
         raise InputError(f"{unknown[0]!r} is no route; expected one of {', '.join(map(repr, FOOTAGE))}")
@@ -111,6 +166,11 @@ def run_views(data: Path, *, out: Path, routes: Sequence[str] = ()) -> list[str]
     planned = [(name, rate, None) for rate in RATES for name in some]
     planned += [(name, "default", shift) for shift in POINTED for name in some]  # type: ignore[misc]
     rows: list[Row] = []
+    if choose:
+        for name, shift in tqdm([*product(some, (None, *POINTED[1:]))], "routes", disable=None, leave=False):
+            rows += bench_settings(name, data, shift)
+            write_bench(out, rows)
+        return [table(rows, COLUMNS, "{case}, {contender}"), "AUC; shares of the width"]
     for name, rate, shift in tqdm(planned, "routes", disable=None, leave=False):
         rows += bench_views(name, data, rate, shift)
         write_bench(out, rows)

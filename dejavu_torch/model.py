@@ -9,16 +9,17 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, TypeVar, cast
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 from torch import Tensor, nn
 from torch.nn.parameter import is_lazy
 
 from dejavu_torch import learning, model_file
+from dejavu_torch.data.moving import unmoved
 from dejavu_torch.data.source import Source, as_traverse
 from dejavu_torch.data.traverse import Part, at_size, resize_like, size_like
 from dejavu_torch.data.turning import Turned
-from dejavu_torch.features.descriptor import Descriptor, own_size
+from dejavu_torch.features.descriptor import Descriptor, OnFirst, own_size
 from dejavu_torch.features.extract import features_of
 from dejavu_torch.features.joined import Joined
 from dejavu_torch.features.preprocess import Preprocess
@@ -534,27 +535,38 @@ class DejaVu(nn.Module):
         centres &= whole or sequence is None
         querying = self.looking(queries, querying, ordered, centres)
         matching = matching._replace(k=querying.top, radius=apart, wrappers=querying.wrappers)
-        count, queries = len(queries), querying.copies_of(queries, self.map.layout)
-        shape, name = queries.frame_shape, queries.name
+        copies, asked = querying.copies_of(queries, self.map.layout), (queries, querying)
+        shape, name, turned = queries.frame_shape, queries.name, isinstance(copies, Turned)
 
         def on_first(frames: Tensor, features: Tensor) -> None:
             check_queries(self, shape, features.shape[1], name)
             self.descriptor.warn_of_bright(frames, name)
 
-        turned = isinstance(queries, Turned)
         learns = querying.views.learns and sequence is None  # of single images: from those after them, too
         together = whole or loops is not None or headings > 1 or learns
         if not (together or (querying.centres(False) and not turned)):
             localizer = self.localizer(matching.as_it_drives())
-            batches = self.descriptor.batches(queries, progress, "localizing", on_first)
+            batches = self.descriptor.batches(copies, progress, "localizing", on_first)
             yield from map(localizer, (set_apart(self.map, rows) if turned else rows for rows in batches))
             return
-        descriptors = self.descriptor.all_of(queries, progress, on_first)
-        if turned:
-            descriptors = set_apart(self.map, descriptors)
-        elif centres:
-            descriptors = centred(self.map, descriptors, len(descriptors) // count)
+        descriptors = self.described(*asked, centres, progress, on_first)
         yield answer(self.scorer(descriptors, matching), matching, progress)
+
+    def described(
+        self,
+        queries: Traverse,
+        querying: Querying = QUERYING,
+        centre: bool = False,
+        progress: bool = False,
+        on_first: OnFirst | None = None,
+    ) -> Tensor:
+        """Descriptors of all copies of queries, which lie as the map's frames: of turned ones by `set_apart`,
+        of others `centred`, if so."""
+        copies = querying.copies_of(queries, self.map.layout)
+        rows = self.descriptor.all_of(copies, progress, on_first)
+        if isinstance(copies, Turned):
+            return set_apart(self.map, rows)
+        return centred(self.map, rows, querying.copies) if centre else rows
 
     def views_at_first(self, querying: Sequences, images: bool, learns: bool) -> Views:
         """The views of queries before these have shown which are of use.
@@ -600,22 +612,28 @@ class DejaVu(nn.Module):
         surely have come back."""
         first, count, copies = 0, min(FIRST, len(drive)), len(views.shifts)
         if loops is not None:
-            alone = Earlier(self.scorer(self.descriptor.all_of(drive)), loops)
+            alone = Earlier(self.scorer(self.described(drive)), loops)
             sure = confidence(best_pairs(alone, 1, len(drive))).nan_to_num(0, -1e3, -1e3)
             first = int(sure.unfold(0, count, 1).mean(1).argmax())
-        rows = self.descriptor.all_of(views.of(Part(drive, range(first, first + count))))
-        rows = centred(self.map, rows, copies) if centre else rows
-        scorer = self.scorer(rows)
+        some = Part(drive, range(first, first + count))
+        scorer = self.scorer(self.described(some, Querying(views=views), centre))
         return views.learned(scorer if loops is None else Earlier(scorer, loops, first, copies))
+
+    def shown_by(self, drive: Traverse) -> Views:
+        """The views that a drive shows to be of use; `ALONE` if none is, or it is too short to tell."""
+        views = self.views_at_first(QUERYING, len(drive.frame_shape) == 3, True)
+        if views == ALONE or len(drive) < LEAST:
+            return ALONE
+        shown = self._shown(drive, views, self.centres(len(drive)))
+        return shown if shown.known[0] != ALONE.shifts else ALONE
 
     def look_at(self, visit: Traverse | AugmentedFrames) -> DejaVu:
         """Let single images be compared with the views that another visit, in order, shows to be of use."""
-        drive = hasattr(visit, "layout") and self.views is None  # copies of frames lie nowhere
-        if drive and len(visit) >= LEAST and self.descriptor.fits(self.map.dimension, visit):
-            views = self.views_at_first(QUERYING, len(visit.frame_shape) == 3, True)
-            if views != ALONE:
-                shown = self._shown(cast(Traverse, visit), views, self.centres(min(FIRST, len(visit))))
-                self.views = shown.with_unmoved if shown.known[0] != ALONE.shifts else None
+        if isinstance(visit, Traverse) and self.views is None:  # copies of frames lie nowhere
+            if not self.descriptor.fits(self.map.dimension, visit):
+                return self
+            shown = self.shown_by(unmoved(visit))
+            self.views = None if shown == ALONE else shown.with_unmoved
         return self
 
     def centres(self, queries: int) -> bool:

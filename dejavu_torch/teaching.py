@@ -11,6 +11,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from dejavu_torch.data.moving import Moved
 from dejavu_torch.data.source import Source, as_traverse
 from dejavu_torch.data.traverse import chained
 from dejavu_torch.features.views import LabelledFrames, Placed
@@ -22,10 +23,7 @@ from dejavu_torch.model import DejaVu, check_queries, require_map
 from dejavu_torch.recognition.calibration import TOLERANCE, Calibration, calibrated_by_drive
 from dejavu_torch.recognition.centring import centred
 from dejavu_torch.recognition.evidence import spacing_of
-from dejavu_torch.recognition.localizer import answer
-from dejavu_torch.recognition.querying import QUERYING
 from dejavu_torch.recognition.smoother import PlaceSmoother
-from dejavu_torch.recognition.views import ALONE, BestView
 from dejavu_torch.types import InputError, Traverse, expect
 
 SURE = 0.9  # probability of a frame that teaches
@@ -51,26 +49,12 @@ def place_drive(model: DejaVu, descriptors: Tensor) -> Tensor:
     return torch.full_like(places, -1) if few or not match.is_drive else places
 
 
-@torch.no_grad()
-def straightened(model: DejaVu, drive: Traverse, progress: bool = False) -> Tensor:
-    """Descriptors (Q,K) of the frames of a drive, each of the view that looks as at learning, where the drive
-    as a whole finds it."""
-    count, centres = len(drive), model.centres(len(drive))
-    views = model.looking(drive, QUERYING, True, centres).views
-    rows = model.descriptor.all_of(views.of(drive), progress).float().to(model.map.device)
-    if views == ALONE:
-        return rows
-    best = views(model.scorer(centred(model.map, rows, len(rows) // count) if centres else rows))
-    match = answer(best, model.matching(PlaceSmoother()))
-    assert isinstance(best, BestView)
-    if not match.is_drive or match.probability is None:
-        return rows[:: best.copies]
-    parts = torch.arange(count).split(max(1, best.at_once // model.map.places))
-    copy = torch.cat([best.copy_at(part, match.index[part, None])[:, 0].cpu() for part in parts])
-    sure = match.probability >= SURE
-    usual = int(copy[sure if sure.any() else ~sure].mode().values)
-    copy = torch.where(sure, copy, usual)  # of frames whose place is not known
-    return rows[(torch.arange(count) * best.copies + copy).to(rows.device)]
+def straightened(model: DejaVu, drive: Traverse) -> Traverse:
+    """A drive as a camera would see it that points where it did at learning, as far as its first frames tell
+    how far to the side its own does."""
+    shown = model.shown_by(drive)
+    usual = min(zip(shown.penalties, shown.shifts, strict=True))[1]
+    return Moved(drive, (usual,)) if usual else drive
 
 
 def place_drives(
@@ -81,13 +65,13 @@ def place_drives(
     most: int = ROUNDS,
 ) -> LabelledFrames:
     """Place drives on a map of the reference, learned from augmented copies, and once more on one that the
-    drives have taught.
+    drives have taught. The frames of those of a camera that points to the side are moved sideways.
 
     Args:
         model: its settings. reference: None is the model's own map, which learns nothing.
         drives: in order, each with the place of each frame if it is known. most: rounds of placing.
     """
-    frames, lengths = chained([drive for drive, _ in drives]), [len(drive) for drive, _ in drives]
+    lengths = [len(drive) for drive, _ in drives]
     which = torch.arange(len(drives)).repeat_interleave(torch.tensor(lengths))
     names = {i: drive.name for i, (drive, known) in enumerate(drives) if known is None}
     scratch, views = copy.deepcopy(model), None
@@ -95,10 +79,14 @@ def place_drives(
         for rounds in range(1, most + 1):
             if reference is not None:
                 scratch.learn(reference, progress, views)
-            found = [
-                place_drive(scratch, straightened(scratch, drive, progress)).cpu() if known is None else known
-                for drive, known in drives
-            ]
+            if views is None:
+                own = (
+                    drive if known is not None else straightened(scratch, drive) for drive, known in drives
+                )
+                frames = chained([*own])
+            parts = scratch.descriptor.all_of(frames, progress).split(lengths)
+            pairs = zip(parts, drives, strict=True)
+            found = [place_drive(scratch, part) if known is None else known for part, (_, known) in pairs]
             before, places = views, torch.cat(found)
             views = LabelledFrames(frames, places, Placed(which, names, SURE, rounds))
             if not (places >= 0).any() or (before is not None and torch.equal(before.places, places)):
@@ -180,7 +168,8 @@ def described(model: DejaVu, drive: Source, verb: str, progress: bool = False) -
     expect(len(traverse) >= SHORTEST, f"at least {SHORTEST}", f"{traverse.name} has {len(traverse)} frames")
     features = model.descriptor.count_features(traverse)
     check_queries(model, traverse.frame_shape, features, traverse.name)
-    return traverse, straightened(model, traverse, progress)
+    rows = model.described(straightened(model, traverse), progress=progress)
+    return traverse, rows.float().to(place_map.device)
 
 
 class Refined(NamedTuple):
@@ -230,7 +219,8 @@ def refined_by(model: DejaVu, descriptors: Tensor) -> Refined:
 def calibrate_by(model: DejaVu, drive: Traverse, progress: bool = False) -> LabelledFrames:
     """Calibrate a map by all frames of a drive whose places nobody told, not only those that are placed; not
     if none is. Returns where they are."""
-    descriptors = straightened(model, drive, progress)
+    descriptors = model.described(straightened(model, drive), progress=progress)
+    descriptors = descriptors.float().to(model.map.device)
     places = place_drive(model, descriptors)
     if (places >= 0).any():
         scores = (model.map.scores(rows) for rows in descriptors.split(_at_once(model.map)))

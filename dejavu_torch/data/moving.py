@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
-from dejavu_torch.data.traverse import Part
+from dejavu_torch.data.traverse import Chain, Part, chained
 from dejavu_torch.types import Traverse
 
 MOST = 0.5  # of the width, beyond which more is reflected than seen
@@ -50,3 +50,10 @@ class Moved(Part):
         seen, count = super().read(frames), len(self.shifts)
         copies = [moved(one[None], [self.shifts[i % count]]) for i, one in zip(frames, seen, strict=True)]
         return torch.cat(copies)
+
+
+def unmoved(traverse: Traverse) -> Traverse:
+    """The frames as they were, of which each has one moved copy."""
+    if isinstance(traverse, Chain):
+        return chained([unmoved(one) for one in traverse.traverses])
+    return traverse.traverse if isinstance(traverse, Moved) else traverse

@@ -336,7 +336,7 @@ def _answered(plan: Plan, run: Localization) -> tuple[Localization, Match, Match
 
     with timed(plan.seconds, "localize"):
         if run.query is not run.reference or querying.views != ALONE:
-            run = run._replace(query_features=run.described_by(model, progress))
+            run = run._replace(query_features=model.described(run.query, querying, False, progress))
         queries, way = run.query_features, matching.sequence
         if plan.centring and not isinstance(run.asked, Turned):
             run = run._replace(
@@ -401,7 +401,8 @@ def _contenders(plan: Plan, run: Localization) -> dict[str, Contender]:
             yield key, Baseline(name, given if views == 1 else Repeated(given, views), bytes)
         for key, (name, other) in reporting.others.items() if judged else ():
             other.learn(run.reference, progress)
-            scorer, size = other.scorer(run.described_by(other, progress), run.matching), other.summary()
+            described = other.described(run.query, run.querying, False, progress)
+            scorer, size = other.scorer(described, run.matching), other.summary()
             match = answer(scorer, run.matching, progress)
             if run.beside is not None and reporting.drives == "all":
                 drive = answer(scorer, Matching(other.adapted(run.beside)), progress)

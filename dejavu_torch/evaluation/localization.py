@@ -9,12 +9,10 @@ import torch
 from torch import Tensor
 
 from dejavu_torch.data.ground_truth import GroundTruth, scored_and_right
-from dejavu_torch.data.turning import Turned
 from dejavu_torch.evaluation.contenders import Contender, contend
 from dejavu_torch.model import DejaVu
 from dejavu_torch.motion.resampling import ResampledTraverse
 from dejavu_torch.places.positions import unit_of
-from dejavu_torch.recognition.centring import set_apart
 from dejavu_torch.recognition.localizer import SINGLE, Matching, wrapped
 from dejavu_torch.recognition.querying import QUERYING, Querying
 from dejavu_torch.recognition.scorer import OfMap, Scorer
@@ -70,11 +68,6 @@ class Localization(NamedTuple):
     def asked(self) -> Traverse:
         """The frames whose descriptors the queries have: all copies, if there are several of them."""
         return self.querying.copies_of(self.query, self.model.map.layout)
-
-    def described_by(self, model: DejaVu, progress: bool = False) -> Tensor:
-        """The descriptors of the queries by a model, those of turned images by `set_apart`."""
-        rows = model.descriptor.all_of(self.asked, progress)
-        return set_apart(model.map, rows) if isinstance(self.asked, Turned) else rows
 
     def scorer_by(self, make: Callable[[Tensor], Scorer]) -> Scorer:
         """Other scores of the queries, which also know them uncentred."""

@@ -13,13 +13,11 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from dejavu_torch.data.ground_truth import GroundTruth, scored_and_right
-from dejavu_torch.data.turning import Turned
 from dejavu_torch.evaluation.activation import share
 from dejavu_torch.evaluation.curves import evaluate
 from dejavu_torch.evaluation.plots import DARK, GREY, RIGHT, Pictures, canvas, picture
 from dejavu_torch.memory import in_float32
 from dejavu_torch.recognition.calibration import TOLERANCE
-from dejavu_torch.recognition.centring import centred, set_apart
 from dejavu_torch.types import Facts, Match, SequenceModel, Traverse
 
 if TYPE_CHECKING:
@@ -70,12 +68,7 @@ def found_elsewhere(
     for other in off:
         centres = centring and (way is None or way.whole)
         querying = model.looking(other, run.querying, ordered, centres)
-        asked = querying.copies_of(other, model.map.layout)
-        queries = model.descriptor.all_of(asked, progress)
-        if isinstance(asked, Turned):
-            queries = set_apart(model.map, queries)
-        elif centres:
-            queries = centred(model.map, queries, querying.copies)
+        queries = model.described(other, querying, centres, progress)
         matching = model.matching(way)._replace(wrappers=querying.wrappers)
         match = model.localize_descriptors(queries, matching)
         assert match.probability is not None

@@ -137,18 +137,19 @@ class Descriptor(nn.Module):
         height, width = own_size(self.features) or (1, 1)
         size = max(1, min(self.batch_size, BATCH_NUMBERS // (3 * height * width)))
         settings = self.device, progress, verb, on_first, self.describe
-        if shifts := getattr(traverse, "shifts", ()):
-            source = cast(Moved, traverse).traverse
-            return self._moved(source, shifts, size, progress, verb, on_first)
         windows = Windows.of(traverse) if shared else None
         if windows is not None and self.sharing.fits(windows.grid):
             return self._shared(windows, traverse, size, progress, verb, on_first)
+        batches = (
+            self._moved(traverse.traverse, traverse.shifts, size, progress, verb, on_first)
+            if isinstance(traverse, Moved)
+            else feature_batches(traverse, self, size, *settings)
+        )
         if self.known is None:
-            batches = feature_batches(traverse, self, size, *settings)
             return self._set_aside(batches, traverse) if id(traverse) in self.aside else batches
         key = traverse.name if isinstance(traverse, AugmentedFrames) else id(traverse)
         if key not in self.known:
-            features = concatenate(feature_batches(traverse, self, size, *settings), len(traverse))
+            features = concatenate(batches, len(traverse))
             self.known[key] = traverse, features  # which keeps its id
         return (part.to(self.device) for part in self.known[key][1].split(ROWS))
 

@@ -20,9 +20,9 @@ from dejavu_torch.recognition.scorer import BestOf, Scorer
 from dejavu_torch.recognition.select import best_candidates
 from dejavu_torch.types import Match, Traverse, expect
 
-SHIFTS = (0.0, *(sign * round(0.04 * k, 2) for k in range(1, 7) for sign in (1, -1)))  # of the width
+WIDE, APART = 0.24, 0.04  # shares of the width: how far views are moved, and from one to the next
 FIRST, LEAST = 100, 40  # queries that penalties are learned from; fewer do not tell
-# Constants of penalties: chosen on all routes of `benchmarks views`, with drives over other ground.
+# Constants of penalties: see `benchmarks views --choose`; also by drives over other ground.
 SURE, ROUNDS = 1 / 3, 4  # share of the answers that tell, the surest; times that they are asked
 START, NATS = 0.08, 0.04  # first penalty of a moved view, and for each nat by which it is rarer
 AS_IT_IS, OTHER = 2.0, 0.3  # answers by the unmoved view, and by each other, that are taken for granted
@@ -31,6 +31,15 @@ MORE = 0.03  # share of the queries where it has to do so more often with moved 
 CHANCE = 0.08  # share of the answers below which a view is left out; by chance each has one of thirteen
 FLAT = 0.02  # of the unit of scores: if those of all views differ less, they do not tell the shift
 WIDEST = 180  # degrees of a field of view
+
+
+def evenly(apart: float = APART, wide: float = WIDE) -> tuple[float, ...]:
+    """Even shifts to both sides, 0 first."""
+    each = (round(k * apart, 4) for k in range(1, round(wide / apart) + 1))
+    return 0.0, *(side for one in each for side in (one, -one))
+
+
+SHIFTS = evenly()
 
 
 @dataclass(frozen=True)
@@ -168,14 +177,21 @@ def best_pairs(scorer: Scorer, copies: int, queries: int) -> Match:
     return Match.joined(pairs).map(lambda column: column.cpu().view(queries, -1))
 
 
-def penalties_of(pairs: Match, layout: Layout) -> Tensor:
+def penalties_of(
+    pairs: Match,
+    layout: Layout,
+    start: float = START,
+    nats: float = NATS,
+    chance: float = CHANCE,
+    more: float = MORE,
+) -> Tensor:
     """The penalty of each view, (V,), by the `best_pairs` of queries: the fewer of the surest answers a view
     gives, the more it costs, and +inf if these are hardly more than by chance. Moved views are left out
     unless answers then follow each other more often."""
     each = min(2, layout.places)
     copies = pairs.score.shape[1] // each
     alone = torch.full((copies,), math.inf).index_fill(0, torch.tensor(0), 0.0)
-    penalties, share = alone.clamp(max=START), torch.ones(copies)
+    penalties, share = alone.clamp(max=start), torch.ones(copies)
 
     def answered(penalties: Tensor) -> Match:
         total = pairs.score + penalties.to(pairs.score).repeat_interleave(each)
@@ -192,12 +208,10 @@ def penalties_of(pairs: Match, layout: Layout) -> Tensor:
         answers = (total.argmin(1) // each).bincount(minlength=copies) + OTHER
         answers[0] += AS_IT_IS - OTHER
         share = answers / answers.sum()
-        penalties = NATS * (share.max() / share).log()
-    penalties = torch.where(share < CHANCE, math.inf, penalties).float()
-    chance = math.sqrt(
-        len(pairs) * 2 * STEP / layout.places
-    )  # a standard deviation of what is near by chance
-    return penalties if steps(penalties) >= steps(alone) + max(MORE * len(pairs), chance) else alone
+        penalties = nats * (share.max() / share).log()
+    penalties = torch.where(share < chance, math.inf, penalties).float()
+    near = math.sqrt(len(pairs) * 2 * STEP / layout.places)  # by chance: a standard deviation
+    return penalties if steps(penalties) >= steps(alone) + max(more * len(pairs), near) else alone
 
 
 def shift_of(scores: Tensor, shifts: tuple[float, ...]) -> Tensor:
