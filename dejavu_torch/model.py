@@ -649,11 +649,12 @@ class DejaVu(nn.Module):
         search: Search | None = None,
         centre: bool | None = None,
         headings: int = 1,
+        shifts: Literal["auto", "none"] | Sequence[float] = "auto",
     ) -> Match:
         """The k best places of each query; the first is that of `localize`.
 
         Args:
-            queries, sequence, search, centre, headings: see `localize`.
+            queries, sequence, search, centre, headings, shifts: see `localize`.
             k: from 1 to the number of places.
             apart: suppression radius in places, at least 0: any two candidates of a query differ by more.
 
@@ -668,7 +669,7 @@ class DejaVu(nn.Module):
             >>> DejaVu().learn(wave).candidates(wave[20:22], k=3).index[:, 0]
             tensor([20, 21])
         """
-        querying = replace(_querying(sequence, centre, headings), top=k)
+        querying = replace(_querying(sequence, centre, headings, shifts), top=k)
         return Match.joined(self.matches(queries, querying, False, search, apart))
 
     def matching(self, sequence: SequenceModel | None = None, search: Search | None = None) -> Matching:

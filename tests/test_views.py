@@ -25,8 +25,8 @@ from dejavu_torch import (
     open_source,
 )
 from dejavu_torch.data.arrays import ArrayTraverse
-from dejavu_torch.data.moving import Moved, moved
-from dejavu_torch.data.traverse import Part
+from dejavu_torch.data.moving import Moved, moved, unmoved
+from dejavu_torch.data.traverse import Part, chained
 from dejavu_torch.evaluation.options import Reporting
 from dejavu_torch.export import export_onnx, run_session, session_of
 from dejavu_torch.features.descriptor import Descriptor
@@ -35,10 +35,10 @@ from dejavu_torch.features.hog import HOG
 from dejavu_torch.features.joined import Joined
 from dejavu_torch.features.pixels import PatchPixels
 from dejavu_torch.features.views import LabelledFrames
-from dejavu_torch.growth import calibrate_if_possible, merge
+from dejavu_torch.growth import calibrate_if_possible, merge, second_traverse
 from dejavu_torch.places.layout import ROUTE
 from dejavu_torch.recognition.querying import Querying, Sequences
-from dejavu_torch.recognition.scorer import BestOf, OfMap, OfRows, OfStored
+from dejavu_torch.recognition.scorer import BestOf, OfMap, OfRows, OfStored, Reordered
 from dejavu_torch.recognition.views import (
     ALONE,
     FIRST,
@@ -49,7 +49,7 @@ from dejavu_torch.recognition.views import (
     penalties_of,
     shift_of,
 )
-from dejavu_torch.teaching import refine
+from dejavu_torch.teaching import refine, straightened
 
 PLACES, WIDE, SIDE = 130, 112, 64  # pixels of the scenes, and of what a camera sees of them
 OFFSET = 8 / SIDE  # by which it points further right on the second visit
@@ -398,6 +398,51 @@ def test_a_drive_without_truth_is_placed_by_its_views():
     calibrate_if_possible(own, visit(0), visit(2, OFFSET))
     assert dict(zip(*own.views.known, strict=True))[0.12] == 0
     assert refine(small().learn(visit(0)), visit(2, OFFSET)).placed == PLACES
+
+
+def test_a_drive_that_comes_back_with_another_camera_finds_its_loops():
+    both = ArrayTraverse(torch.cat([visit(0)[:], visit(1, OFFSET)[:]]), "twice")
+    both.ordered = True
+    own = small().learn(both)
+    alone, match = (own.loops(both, 60, shifts=shifts) for shifts in ("none", "auto"))
+    right = [(one.index[PLACES:] - torch.arange(PLACES)).abs() <= 5 for one in (alone, match)]
+    assert right[1].double().mean() > right[0].double().mean() + 0.2
+    assert not match.accepted[:PLACES].any()
+    shift = match.shift[PLACES:][right[1]]
+    assert abs(float(shift.nanmedian()) - OFFSET) < 0.02
+    (same,) = own.matches(both, Querying(match="drive", loops=60, fov=90))
+    assert torch.equal(same.index, match.index)
+    assert same.shift_degrees is not None
+    given = own.loops(both, 60, shifts=[OFFSET])
+    assert ((given.index[PLACES:] - torch.arange(PLACES)).abs() <= 5).double().mean() > 0.9
+
+
+def test_a_drive_teaches_as_the_camera_before_would_see_it(model):
+    moved_back = straightened(model, visit(1, OFFSET))
+    assert moved_back.shifts == (0.12,)
+    assert straightened(model, visit(1)).name == visit(1).name
+    chain = chained([moved_back, visit(1)])
+    assert [type(one) for one in unmoved(chain).traverses] == [ArrayTraverse] * 2
+
+
+def test_whitening_learns_from_frames_that_are_moved_back(model):
+    views = second_traverse(small(), visit(0), visit(1, OFFSET))
+    assert (views.places >= 0).all()
+    assert views.traverse.shifts == (0.12,)
+    own = small().learn(visit(0), second=views)
+    assert dict(zip(*own.views.known, strict=True))[0.12] == 0  # by the frames as they were
+
+
+@pytest.mark.parametrize("metric", ["cosine", "l2"])
+def test_some_places_have_the_scores_that_all_have(metric):
+    rows = torch.randn(90, 12)
+    route = SpectralMapper(chunk=32, metric=metric)(rows)
+    queries, places = torch.randn(7, 12), torch.randint(90, (7, 3))
+    expected = route.scores(queries).gather(1, places)
+    assert torch.allclose(route.scores_at(queries, places), expected, atol=1e-5)
+    shuffled = Reordered(OfMap(route, queries), torch.randperm(90))
+    expected = shuffled.rows(torch.arange(7)).gather(1, places)
+    assert torch.allclose(shuffled.at(torch.arange(7), places), expected, atol=1e-5)
 
 
 def test_a_camera_that_looks_along_its_way_has_no_views():

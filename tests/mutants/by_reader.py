@@ -39,8 +39,8 @@ MUTANTS = [
     Mutant(
         "A query of length 0 scores 1 at every place of a cosine map, not NaN.",
         "dejavu_torch/maps/spectral_map.py",
-        "queries = queries / torch.where(length > 0, length, 1)",
-        "queries = queries / length",
+        "queries / torch.where(length > 0, length, 1)",
+        "queries / length",
         ("tests/maps/test_spectral.py::-k scores_are or without_a_descriptor",),
     ),
     Mutant(

@@ -691,8 +691,8 @@ MUTANTS = [
     Mutant(
         "A frame finds no loop to itself, or to the frames just before it.",
         "dejavu_torch/recognition/scorer.py",
-        "place >= (queries[:, None] - self.apart)",
-        "place > (queries[:, None] - self.apart)",
+        "closed = place >= (",
+        "closed = place > (",
         ("tests/test_loops.py::-k second_lap",),
     ),
     Mutant(
@@ -1132,7 +1132,7 @@ MUTANTS = [
     Mutant(
         "A view that gives no more answers than chance is left out.",
         "dejavu_torch/recognition/views.py",
-        "share < CHANCE, math.inf",
+        "share < chance, math.inf",
         "share < 0, math.inf",
         ("tests/test_views.py::-k chance",),
     ),
@@ -1158,10 +1158,10 @@ MUTANTS = [
         ("tests/test_views.py::-k live",),
     ),
     Mutant(
-        "Frames of a drive teach by the view that looks as at learning.",
+        "Frames of a drive teach as a camera would see them that points where it did at learning.",
         "dejavu_torch/teaching.py",
-        "* best.copies + copy",
-        "* best.copies",
+        "return Moved(drive, (usual,)) if usual else drive",
+        "return drive",
         ("tests/test_views.py::-k placed_by",),
     ),
 ]
