@@ -11,7 +11,7 @@ import re
 import sys
 from collections.abc import Callable, Iterable, Sequence
 from functools import partial
-from itertools import groupby
+from itertools import groupby, product
 from pathlib import Path
 from statistics import mean, median
 from typing import Any
@@ -261,6 +261,35 @@ def views() -> str:
             cells.append(f"{min(views - alone for alone, views in each):+.3f}")
         errors = [row["shift_error"] for row in some if row.get("shift_error") is not None and shift]
         table.append([name, *cells, f"{100 * median(errors):.1f} %" if errors else ""])
+    return markdown(table)
+
+
+def view_settings() -> str:
+    """One image by confidence, by other steps between views and other constants of penalties: means over
+    every second route, of which one would choose, and over the others; and the processor time of a query."""
+    rows, cases = read("view_settings")["rows"], (("as filmed", False), ("cut", True))
+    halves = [[*dict.fromkeys(row["case"] for row in rows)][first::2] for first in (0, 1)]
+    table = [["mean AUC", *(f"{name}, {half}" for name, _ in cases for half in ("half", "other half")), "ms"]]
+    for setting in dict.fromkeys(row["contender"] for row in rows):
+        cells, own = [], [row for row in rows if row["contender"] == setting]
+        for (_, cut), half in product(cases, halves):
+            some = [row for row in own if row["case"] in half and ("shift" in row) == cut]
+            cells.append(area(mean(row["auc_one"] for row in some)))
+        steps = setting.startswith("steps")
+        table.append([setting, *cells, f"{mean(row['ms'] for row in own):.1f}" if steps else ""])
+    return markdown(table)
+
+
+def view_loops() -> str:
+    """Loops of a drive that is both visits, as they are and by views: shares of the second visit's frames."""
+    keys = {"right": "right", "taken": "right and accepted", "wrong": "wrong and accepted"}
+    table = [["loops", "routes", *(cell for name in keys.values() for cell in (name, "by views"))]]
+    for name, shift in (("as filmed", 0.0), *((f"cut, {100 * one:+.0f} %", one) for one in POINTED[1:])):
+        rows = [row for row in read("view_loops")["rows"] if ("shift" in row) == bool(shift)]
+        rows = [row for row in rows if abs(row.get("shift", 0.0) - shift) < POINTED_WITHIN]
+        ways = [[row for row in rows if row["contender"] == way] for way in WAYS]
+        figures = (mean(row[key] for row in own) for key in keys for own in ways)
+        table.append([name, str(len(ways[0])), *map(area, figures)])
     return markdown(table)
 
 
@@ -593,7 +622,7 @@ def trainings() -> str:
 TABLES: dict[str, Callable[[], str]] = {
     **{"leaderboard": leaderboard, "sure": sure, "losses": losses, "routes": routes},
     **{"demo": demo, "front": front, "files": sizes, "order": order, "ordered": ordered},
-    "views": views,
+    **{"views": views, "view_settings": view_settings, "view_loops": view_loops},
     **{"descriptors": descriptors, "sequences": sequences},
     **{"rejection": rejection, "filtered": filtered, "drives": drives, "driven": driven},
     **{"trainings": trainings, "made drives": made_drives, "storage drives": storage_drives},

@@ -15,9 +15,9 @@ from tqdm import tqdm
 
 from benchmarks.cross import FOOTAGE as EVERY
 from benchmarks.measure import Column, Row, new_row, table, truth_of, write_bench
-from dejavu_torch.data.ground_truth import GroundTruth
+from dejavu_torch.data.ground_truth import GroundTruth, scored_and_right
 from dejavu_torch.data.source import open_source
-from dejavu_torch.data.traverse import Cropped, Part
+from dejavu_torch.data.traverse import Cropped, Part, chained
 from dejavu_torch.evaluation.curves import area, by_confidence, curve_of, evaluate
 from dejavu_torch.evaluation.rejection import calibration_error, judged
 from dejavu_torch.growth import calibrate_if_possible
@@ -36,6 +36,7 @@ POINTED = (0.0, 0.1, -0.17)  # of what is left: by how much the second camera po
 POINTED_WITHIN = 0.03  # of these, in whole pixels
 RATES = {"default": None, "half a byte": 0.5}
 ASKED = 1000  # queries, from the middle
+APART_LOOPS, MOST_LOOPED = 50, 4000  # frames before one that are no loop; frames of a drive
 STEPS = (0.02, APART, 0.08)  # between views, in shares of the width
 SETTINGS: dict[str, dict[str, float]] = {
     "as it is": {},
@@ -141,6 +142,29 @@ def bench_settings(name: str, data: Path, shift: float | None) -> Iterator[Row]:
     yield new_row(name, "none", KEYS, rate="default", shift=known) | figures
 
 
+def bench_loops(name: str, data: Path, shift: float | None) -> Iterator[Row]:
+    """A row for each way of the loops of one drive, the first visit of a route and then the second: shares of
+    the second's frames whose answer is right, right and accepted, and wrong and accepted."""
+    one = FOOTAGE[name]
+    visits = [open_source(source.format(data=data)) for source in (one.reference, one.query)]
+    truth, known = truth_of(visits[0], visits[1], one.truth and one.truth.format(data=data)), None
+    if shift is not None:
+        *visits, known = pointed(visits[0], visits[1], shift)
+    if visits[0].frame_shape != visits[1].frame_shape or sum(map(len, visits)) > MOST_LOOPED:
+        return
+    drive, first = chained(visits), len(visits[0])
+    drive.ordered = True
+    model = DejaVu().learn(drive)
+    calibrate_if_possible(model, drive)
+    for way in WAYS:
+        match = model.loops(drive, APART_LOOPS, shifts=way)[first:]
+        kept, right = scored_and_right(match.index, truth, one.tolerance)
+        taken = match.accepted[kept]
+        shares = {"right": right, "taken": taken & right, "wrong": taken & ~right}
+        figures = {key: float(one.double().mean()) for key, one in shares.items()}
+        yield new_row(name, way, ("shift", *figures), shift=known) | figures
+
+
 def _all(model: DejaVu, query: Traverse, querying: Querying) -> Match:
     return Match.joined(model.matches(query, querying))
 
@@ -149,9 +173,15 @@ COLUMNS: dict[str, Column] = {
     **{"one image": ("auc_one", ".3f"), "whole drive": ("auc", ".3f"), "error": ("error", ".3f")},
     **{"shift": ("shift", ".2f"), "its error": ("shift_error", ".3f"), "ms": ("ms", ".1f")},
 }
+LOOPED: dict[str, Column] = {
+    **{"right": ("right", ".3f"), "accepted": ("taken", ".3f"), "wrongly": ("wrong", ".3f")},
+    "shift": ("shift", ".2f"),
+}
 
 
-def run_views(data: Path, *, out: Path, routes: Sequence[str] = (), choose: bool = False) -> list[str]:
+def run_views(
+    data: Path, *, out: Path, routes: Sequence[str] = (), choose: bool = False, loops: bool = False
+) -> list[str]:
     """Images compared as they are and moved sideways: AUC of one image and of the whole drive, and the shift.
 
     Args:
@@ -159,6 +189,7 @@ def run_views(data: Path, *, out: Path, routes: Sequence[str] = (), choose: bool
         out: folder for bench.json
         routes: names of routes; all if not given
         choose: instead, steps between views and the constants of penalties
+        loops: instead, loops of one drive that is both visits, one after the other
     """
     if unknown := [name for name in routes if name not in FOOTAGE]:
         raise InputError(f"{unknown[0]!r} is no route; expected one of {', '.join(map(repr, FOOTAGE))}")
@@ -166,11 +197,11 @@ def run_views(data: Path, *, out: Path, routes: Sequence[str] = (), choose: bool
     planned = [(name, rate, None) for rate in RATES for name in some]
     planned += [(name, "default", shift) for shift in POINTED for name in some]  # type: ignore[misc]
     rows: list[Row] = []
-    if choose:
+    if choose or loops:
         for name, shift in tqdm([*product(some, (None, *POINTED[1:]))], "routes", disable=None, leave=False):
-            rows += bench_settings(name, data, shift)
+            rows += (bench_settings if choose else bench_loops)(name, data, shift)
             write_bench(out, rows)
-        return [table(rows, COLUMNS, "{case}, {contender}"), "AUC; shares of the width"]
+        return [table(rows, COLUMNS if choose else LOOPED, "{case}, {contender}"), "AUC, or shares"]
     for name, rate, shift in tqdm(planned, "routes", disable=None, leave=False):
         rows += bench_views(name, data, rate, shift)
         write_bench(out, rows)

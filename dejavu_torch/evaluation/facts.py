@@ -115,7 +115,9 @@ def match_facts(
 def view_facts(run: Localization) -> Facts:
     """The entry `views` of report.json, if images were also compared moved sideways: by its shift the penalty
     of each view that answers, and the median shift of the answers."""
-    best = run.querying.views(OfMap(run.model.map, run.query_features))
+    causal = None if run.way is None or run.way.whole else run.causal_features
+    features = run.query_features if causal is None else causal
+    best = run.querying.views(OfMap(run.model.map, features))
     if not isinstance(best, BestView):
         return {}
     own = zip(best.kept.tolist(), best.penalties[0].tolist(), strict=True)
