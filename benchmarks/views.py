@@ -159,9 +159,8 @@ def bench_loops(name: str, data: Path, shift: float | None) -> Iterator[Row]:
     for way in WAYS:
         match = model.loops(drive, APART_LOOPS, shifts=way)[first:]
         kept, right = scored_and_right(match.index, truth, one.tolerance)
-        taken = match.accepted[kept]
-        shares = {"right": right, "taken": taken & right, "wrong": taken & ~right}
-        figures = {key: float(one.double().mean()) for key, one in shares.items()}
+        shares = {"right": right, "taken": match.accepted & right, "wrong": match.accepted & ~right}
+        figures = {key: float(one[kept].double().mean()) for key, one in shares.items()}
         yield new_row(name, way, ("shift", *figures), shift=known) | figures
 
 

@@ -9,7 +9,7 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, TypeVar
+from typing import TYPE_CHECKING, Any, Literal, TypeVar, cast
 
 from torch import Tensor, nn
 from torch.nn.parameter import is_lazy
@@ -18,7 +18,7 @@ from dejavu_torch import learning, model_file
 from dejavu_torch.data.moving import unmoved
 from dejavu_torch.data.source import Source, as_traverse
 from dejavu_torch.data.traverse import Part, at_size, resize_like, size_like
-from dejavu_torch.data.turning import Turned
+from dejavu_torch.data.turning import is_turned
 from dejavu_torch.features.descriptor import Descriptor, OnFirst, own_size
 from dejavu_torch.features.extract import features_of
 from dejavu_torch.features.joined import Joined
@@ -536,7 +536,7 @@ class DejaVu(nn.Module):
         querying = self.looking(queries, querying, ordered, centres)
         matching = matching._replace(k=querying.top, radius=apart, wrappers=querying.wrappers)
         copies, asked = querying.copies_of(queries, self.map.layout), (queries, querying)
-        shape, name, turned = queries.frame_shape, queries.name, isinstance(copies, Turned)
+        shape, name, turned = queries.frame_shape, queries.name, is_turned(copies)
 
         def on_first(frames: Tensor, features: Tensor) -> None:
             check_queries(self, shape, features.shape[1], name)
@@ -564,7 +564,7 @@ class DejaVu(nn.Module):
         of others `centred`, if so."""
         copies = querying.copies_of(queries, self.map.layout)
         rows = self.descriptor.all_of(copies, progress, on_first)
-        if isinstance(copies, Turned):
+        if is_turned(copies):
             return set_apart(self.map, rows)
         return centred(self.map, rows, querying.copies) if centre else rows
 
@@ -629,10 +629,9 @@ class DejaVu(nn.Module):
 
     def look_at(self, visit: Traverse | AugmentedFrames) -> DejaVu:
         """Let single images be compared with the views that another visit, in order, shows to be of use."""
-        if isinstance(visit, Traverse) and self.views is None:  # copies of frames lie nowhere
-            if not self.descriptor.fits(self.map.dimension, visit):
-                return self
-            shown = self.shown_by(unmoved(visit))
+        drive = hasattr(visit, "layout") and self.views is None  # copies of frames lie nowhere
+        if drive and self.descriptor.fits(self.map.dimension, visit):
+            shown = self.shown_by(unmoved(cast(Traverse, visit)))
             self.views = None if shown == ALONE else shown.with_unmoved
         return self
 
@@ -649,12 +648,11 @@ class DejaVu(nn.Module):
         search: Search | None = None,
         centre: bool | None = None,
         headings: int = 1,
-        shifts: Literal["auto", "none"] | Sequence[float] = "auto",
     ) -> Match:
         """The k best places of each query; the first is that of `localize`.
 
         Args:
-            queries, sequence, search, centre, headings, shifts: see `localize`.
+            queries, sequence, search, centre, headings: see `localize`; views of images by default.
             k: from 1 to the number of places.
             apart: suppression radius in places, at least 0: any two candidates of a query differ by more.
 
@@ -669,7 +667,7 @@ class DejaVu(nn.Module):
             >>> DejaVu().learn(wave).candidates(wave[20:22], k=3).index[:, 0]
             tensor([20, 21])
         """
-        querying = replace(_querying(sequence, centre, headings, shifts), top=k)
+        querying = replace(_querying(sequence, centre, headings), top=k)
         return Match.joined(self.matches(queries, querying, False, search, apart))
 
     def matching(self, sequence: SequenceModel | None = None, search: Search | None = None) -> Matching:

@@ -35,17 +35,15 @@ from dejavu_torch.maps.spectral_map import SpectralMap
 from dejavu_torch.maps.spectrum import by_frequency, frequencies, from_lines, lines_of
 from dejavu_torch.places.layout import Layout
 from dejavu_torch.places.rectangles import Rectangle
-from dejavu_torch.recognition import flight as flights
 from dejavu_torch.recognition.coarse import CoarseSearch, SamplingPlan
+from dejavu_torch.recognition.engine import Evidence, FittedPart, Rates, explained, normalised
 from dejavu_torch.recognition.evidence import RankTable, standardised
 from dejavu_torch.recognition.localizer import Matching
-from dejavu_torch.recognition.motion import Rates
-from dejavu_torch.recognition.plane import Followed, PlaneMotion
+from dejavu_torch.recognition.plane import ByPlace, Followed, PlaneMotion
 from dejavu_torch.recognition.samples import RowSearch
 from dejavu_torch.recognition.scorer import OfRows
 from dejavu_torch.recognition.search import Scan
 from dejavu_torch.recognition.select import best_candidates
-from dejavu_torch.recognition.smoother import log_likelihood
 from dejavu_torch.types import Match
 
 SIDES = st.integers(1, 40)
@@ -257,7 +255,7 @@ def test_a_filter_moves_over_an_area(small_tiles, area):
     kernel = torch.rand(5, 5, generator=torch.Generator().manual_seed(2))
     kernel /= kernel.sum()
     rates = Rates(kernel.flatten(), *torch.tensor([0.05, 0.1, 0.2]))
-    motion = PlaneMotion(area, rates)
+    motion = ByPlace(area, rates)
     step = transitions(area.cells(torch.arange(places)), kernel, *rates[1:])
     belief, message = torch.rand(2, places + 1, generator=torch.Generator().manual_seed(0))
     belief /= belief.sum()
@@ -269,7 +267,7 @@ def test_a_filter_moves_over_an_area(small_tiles, area):
     # of one move between two windows
     one, two = torch.zeros(2, places + 1)
     one[area.place_at(torch.tensor([3, 4]))] = two[area.place_at(torch.tensor([2, 6]))] = 1
-    counts = PlaneMotion(area, rates._replace(jump=torch.tensor(0.0))).counts(one[None], two[None])
+    counts = ByPlace(area, rates._replace(jump=torch.tensor(0.0))).counts(one[None], two[None])
     assert counts.moves.nonzero().tolist() == [[5 * 1 + 4]]
     kernel = Followed(torch.zeros(25)).moves_after(torch.tensor([0.2, 0.3, 0.5])).view(5, 5)
     torch.testing.assert_close(kernel, kernel.T)
@@ -321,16 +319,17 @@ def test_a_sweep_gives_the_masses_of_the_model(small_tiles, area):
     kernel /= kernel.sum()
     still = torch.tensor([False, False, True, False, False])
     weight = torch.tensor([1.0, 1.0, 0.5, 0.5, 1.0])
-    with torch.no_grad():
-        swept = flights._sweep(smoother, area, std, weight, still, values.values, 2.0, kernel)
+    _, jump, leave = smoother.rate_logits.detach().softmax(0)
+    motion = PlaneMotion(area, Rates(kernel.flatten(), jump, leave, smoother.enter_logit.detach().sigmoid()))
+    told = Evidence(values.values, 2.0, smoother.tempering)
+    blocks = [*explained(FittedPart(std, weight, still, motion), told, motion, 2)][::-1]
+    found = [motion.folded(torch.cat([one.posterior for one in blocks]))]
+    found.append(motion.folded(torch.cat([normalised(one.before * one.after) for one in blocks])))
 
     n, cells = area.places, area.cells(torch.arange(area.places))
-    _, jump, leave = smoother.rate_logits.detach().softmax(0)
-    step = transitions(cells, kernel, jump, leave, smoother.enter_logit.detach().sigmoid())
-    log = log_likelihood(values.values, std, weight, 2.0, smoother.tempering)
-    seen = torch.cat([log.exp(), torch.ones(queries, 1)], 1).double()
-    belief = torch.full((n + 1,), 0.5 / n, dtype=torch.float64)
-    belief[n] = 0.5
+    step = transitions(cells, kernel, *motion.rates[1:])
+    seen = torch.cat([told(std, weight).exp(), torch.ones(queries, 1)], 1).double()
+    belief = motion.folded(motion.anywhere()).double()
     forward, before, total = [], [], 0.0
     for t in range(queries):
         if t and not still[t]:
@@ -342,12 +341,12 @@ def test_a_sweep_gives_the_masses_of_the_model(small_tiles, area):
         forward.append(belief)
     message = torch.ones(n + 1, dtype=torch.float64)
     for t in reversed(range(queries)):
-        for own, found in ((forward[t], swept.mass[t]), (before[t], swept.others[t])):
+        for own, masses in ((forward[t], found[0]), (before[t], found[1])):
             mass = own * message / (own * message).sum()
-            torch.testing.assert_close(mass[:n].float(), area.by_place(found[None])[0], rtol=1e-3, atol=1e-5)
+            torch.testing.assert_close(mass.float(), masses[t], rtol=1e-3, atol=1e-5)
         message = message * seen[t]
         message = message if still[t] else step @ message
-    assert swept.log == pytest.approx(total, abs=1e-3)
+    assert float(sum(one.log.sum() for one in blocks)) == pytest.approx(total, abs=1e-3)
 
 
 def flight(area, images, seed=0):

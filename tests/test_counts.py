@@ -23,7 +23,7 @@ from dejavu_torch import (
 )
 from dejavu_torch.evaluation.options import Reporting
 from dejavu_torch.maps.spectral_map import SpectralMap
-from dejavu_torch.recognition.motion import Motion
+from dejavu_torch.recognition.motion import AlongRoute
 from dejavu_torch.recognition.plane import PlaneMotion
 from dejavu_torch.recognition.querying import Querying
 from dejavu_torch.recognition.samples import RowSearch
@@ -52,7 +52,7 @@ def counts(monkeypatch):
 
     counting(SpectralMap, "products", "scored", lambda queries, _: len(queries))
     counting(RowSearch, "__call__", "searched", lambda queries, _: len(queries))
-    counting(Motion, "moved", "moved", lambda belief: belief[..., 0].numel())
+    counting(AlongRoute, "moved", "moved", lambda belief: belief[..., 0].numel())
     counting(PlaneMotion, "moved", "moved", lambda belief: belief[..., 0].numel())
     counting(HOG, "forward", "described", len)
     return found
@@ -86,7 +86,7 @@ RUNS = {  # searched, scored, moved, described
     "filter": (localized(PlaceFilter), (1300, 250, 150, 451)),
     "drive": (localized(PlaceSmoother), (1300, 1152, 1192, 451)),
     "compare": (compared(*ROUTE, "0"), (1450, 3104, 12678, 903)),
-    "compare of an area": (compared(*AREA, None), (58, 1576, 944, 765)),
+    "compare of an area": (compared(*AREA, None), (58, 1576, 3680, 765)),
 }
 
 

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
-from dejavu_torch.data.traverse import Chain, Part, chained
+from dejavu_torch.data.traverse import Part, chained, parts_of
 from dejavu_torch.types import Traverse
 
 MOST = 0.5  # of the width, beyond which more is reflected than seen
@@ -54,6 +54,4 @@ class Moved(Part):
 
 def unmoved(traverse: Traverse) -> Traverse:
     """The frames as they were, of which each has one moved copy."""
-    if isinstance(traverse, Chain):
-        return chained([unmoved(one) for one in traverse.traverses])
-    return traverse.traverse if isinstance(traverse, Moved) else traverse
+    return chained([one.traverse if hasattr(one, "shifts") else one for one in parts_of(traverse)])  # type: ignore[attr-defined]

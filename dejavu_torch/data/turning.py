@@ -43,6 +43,11 @@ class Turned(Part):
         return turned_north(super().read(frames), self.heading[torch.as_tensor(frames)])
 
 
+def is_turned(traverse: Traverse) -> bool:
+    """Whether images are turned, and what they have in common has to be removed, see `set_apart`."""
+    return isinstance(traverse, Turned)
+
+
 def facing_north(traverse: Traverse, layout: Layout, headings: int = 1) -> Traverse:
     """Queries as the map of an area compares them: turned by their own headings, if these are known, or, for
     more than one of `headings`, as many copies of each frame, turned evenly over 360 degrees. On a route, and

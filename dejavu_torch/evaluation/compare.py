@@ -27,7 +27,7 @@ from dejavu_torch.data.ground_truth import (
 )
 from dejavu_torch.data.source import Source, as_traverse
 from dejavu_torch.data.traverse import fitted, kept
-from dejavu_torch.data.turning import Turned, facing_north
+from dejavu_torch.data.turning import facing_north, is_turned
 from dejavu_torch.evaluation.baselines import Baseline, baselines_of, matched
 from dejavu_torch.evaluation.contenders import COLOURS, Contender, contend, models_beside
 from dejavu_torch.evaluation.evaluate import RANKS
@@ -338,7 +338,7 @@ def _answered(plan: Plan, run: Localization) -> tuple[Localization, Match, Match
         if run.query is not run.reference or querying.views != ALONE:
             run = run._replace(query_features=model.described(run.query, querying, False, progress))
         queries, way = run.query_features, matching.sequence
-        if plan.centring and not isinstance(run.asked, Turned):
+        if plan.centring and not is_turned(run.asked):
             run = run._replace(
                 query_features=centred(model.map, queries, querying.copies), causal_features=queries
             )

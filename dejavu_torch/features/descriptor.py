@@ -141,8 +141,8 @@ class Descriptor(nn.Module):
         if windows is not None and self.sharing.fits(windows.grid):
             return self._shared(windows, traverse, size, progress, verb, on_first)
         batches = (
-            self._moved(traverse.traverse, traverse.shifts, size, progress, verb, on_first)
-            if isinstance(traverse, Moved)
+            self._moved(cast(Moved, traverse), size, progress, verb, on_first)
+            if hasattr(traverse, "shifts")
             else feature_batches(traverse, self, size, *settings)
         )
         if self.known is None:
@@ -155,15 +155,14 @@ class Descriptor(nn.Module):
 
     def _moved(
         self,
-        traverse: Traverse,
-        shifts: Sequence[float],
+        traverse: Moved,
         size: int,
         progress: bool,
         verb: str,
         on_first: OnFirst | None,
     ) -> Iterator[Tensor]:
         """Features of copies of each frame, see `Moved`, which share what can be computed once."""
-        count = len(shifts)
+        shifts, count = traverse.shifts, len(traverse.shifts)
 
         def describe(frames: Tensor) -> Tensor:
             return self.describe_moved(frames, shifts).flatten(1)
@@ -173,7 +172,7 @@ class Descriptor(nn.Module):
                 on_first(frames, features[:, : features.shape[1] // count])
 
         settings = self.device, progress, verb, first, describe
-        for batch in feature_batches(traverse, self, size, *settings):
+        for batch in feature_batches(traverse.traverse, self, size, *settings):
             yield batch.unflatten(1, (count, -1)).flatten(0, 1)
 
     @property

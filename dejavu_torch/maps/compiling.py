@@ -7,11 +7,19 @@ from collections.abc import Callable, Sequence
 from threading import Timer
 from typing import Any, TypeAlias
 
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.utils._python_dispatch import is_in_torch_dispatch_mode
+
+from dejavu_torch.memory import is_readable
 from dejavu_torch.text import one_line
 
 log = logging.getLogger("dejavu_torch")
 
 Kernel: TypeAlias = Callable[..., Any]
+Floats: TypeAlias = NDArray[np.float32]
 SILENCE = 2.0  # seconds, longer than a load from the cache takes
 
 
@@ -44,3 +52,20 @@ def compiled(
         return None
     finally:
         notice.cancel()
+
+
+def floats_of(tensor: Tensor) -> Floats | None:
+    """The data of a float32 tensor on the CPU, or None if autograd or a tracer records its operations."""
+    if (
+        not is_readable(tensor)
+        or torch.jit.is_tracing()  # type: ignore[attr-defined, no-untyped-call]
+        or is_in_torch_dispatch_mode()
+        or tensor.dtype != torch.float32
+        or (tensor.requires_grad and torch.is_grad_enabled())
+    ):
+        return None
+    try:
+        floats: Floats = tensor.detach().contiguous().numpy()
+        return floats
+    except (RuntimeError, TypeError):  # sparse tensors have no rows
+        return None

@@ -9,17 +9,13 @@ from typing import Literal, get_args
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import normalize
-from torch.utils._python_dispatch import is_in_torch_dispatch_mode
 
-from dejavu_torch.maps.compiling import compiled
-from dejavu_torch.memory import is_readable
+from dejavu_torch.maps.compiling import Floats, compiled, floats_of
 from dejavu_torch.types import InputError, check_shape, expect
 
 Metric = Literal["l1", "l2", "cosine"]
-Floats = NDArray[np.float32]
 
 WORTH_COMPILING = 2**14  # P x F above which the loop is faster than torch even for one query
 QUERIES_AT_ONCE = 64  # they stay in the cache while templates are read
@@ -73,7 +69,7 @@ def compiled_l1(query: Tensor, templates: Tensor) -> Tensor | None:
     """
     if templates.numel() < WORTH_COMPILING:
         return None
-    a, b = _floats(query), _floats(templates)
+    a, b = floats_of(query), floats_of(templates)
     if a is None or b is None or (kernel := _compiled()) is None:
         return None
     out = np.empty((len(a), len(b)), np.float32)
@@ -92,23 +88,6 @@ def compiled_l1(query: Tensor, templates: Tensor) -> Tensor | None:
         with ThreadPoolExecutor(threads) as pool:
             list(pool.map(lambda task: kernel(*task), tasks))
     return torch.from_numpy(out)
-
-
-def _floats(tensor: Tensor) -> Floats | None:
-    """The data of a float32 tensor on the CPU, or None if autograd or a tracer records its operations."""
-    if (
-        not is_readable(tensor)
-        or torch.jit.is_tracing()  # type: ignore[attr-defined, no-untyped-call]
-        or is_in_torch_dispatch_mode()
-        or tensor.dtype != torch.float32
-        or (tensor.requires_grad and torch.is_grad_enabled())
-    ):
-        return None
-    try:
-        floats: Floats = tensor.detach().contiguous().numpy()
-        return floats
-    except (RuntimeError, TypeError):  # sparse tensors have no rows
-        return None
 
 
 @cache

@@ -15,6 +15,7 @@ from dejavu_torch.memory import in_one_thread
 from dejavu_torch.places.layout import ROUTE
 from dejavu_torch.places.states import States
 from dejavu_torch.recognition.calibration import Platt, best_pair, confidence, confidence_of
+from dejavu_torch.recognition.engine import Motion, folded, normalised
 from dejavu_torch.recognition.evidence import Spacing, spacing_of
 from dejavu_torch.recognition.filter import near_scores
 from dejavu_torch.recognition.flight import place_flight
@@ -27,7 +28,6 @@ from dejavu_torch.recognition.smoother import (
     PlaceSmoother,
     blocks_together,
     check_descriptors,
-    normalised,
 )
 from dejavu_torch.recognition.taken import ALONE, FEW, SURER, UPPER, doubted, singly
 from dejavu_torch.text import progress_of
@@ -196,7 +196,7 @@ def _seen(
     fitted_one: called with 1 for each drive, when its smoother is fitted.
     """
     spacings: dict[int, Spacing] = {}  # of descriptors that several drives share
-    fitted: dict[tuple[int, States, int], list[tuple[int, DriveQuery, Drive]]] = {}
+    fitted: dict[tuple[int, States, int, type[Motion]], list[tuple[int, DriveQuery, Drive]]] = {}
     for i, asked in enumerate(drives):
         scorer, smoother = asked.scorer, asked.smoother.changed(map_links=asked.scorer.links)
         asked = asked._replace(smoother=smoother)
@@ -211,9 +211,14 @@ def _seen(
         asked = asked.fitted(smoother.fit(scorer.rows, descriptors, layout.starts, spacing), spacing)
         smoother = asked.smoother
         fitted_one(1)
-        kind = len(scorer), smoother.states(layout.places, layout.starts), len(smoother.move_logits)
+        kind = (
+            len(scorer),
+            smoother.states(layout.places, layout.starts),
+            len(smoother.move_logits),
+            smoother.motion,
+        )
         fitted.setdefault(kind, []).append((i, asked, smoother.drive(scorer.rows, descriptors, spacing)))
-    for (queries, states, _), alike in fitted.items():
+    for (queries, states, *_), alike in fitted.items():
         every = len(alike) * queries * states.places <= SCORES_KEPT
         alike = [
             (i, asked, drive._replace(rows=Cached(asked.scorer, every).rows)) for i, asked, drive in alike
@@ -222,7 +227,7 @@ def _seen(
         for block in blocks_together(pairs, drives[alike[0][0]].scorer.layout.starts):
             numbers = torch.arange(block.first, block.first + block.log.shape[-1])
             for (i, asked, drive), posterior in zip(alike, block.posterior, strict=True):
-                yield i, asked, Seen(_mass(posterior), drive.rows(numbers).cpu())
+                yield i, asked, Seen(_mass(posterior, states.places), drive.rows(numbers).cpu())
 
 
 def _of_flight(asked: DriveQuery, progress: bool) -> Iterator[tuple[DriveQuery, Seen]]:
@@ -240,7 +245,7 @@ def _of_windows(asked: DriveQuery, progress: bool) -> Iterator[tuple[DriveQuery,
     drive = LargeDrive(scorer, asked.smoother, max(2, asked.k), asked.radius, progress)
     asked = asked.fitted(drive.smoother, drive.spacing)
     for first, posterior, scores, known in drive:
-        mass = _mass(posterior)
+        mass = _mass(posterior, len(known))
         if asked.answers:
             yield asked, Seen(mass, scores, known)
             continue
@@ -249,8 +254,8 @@ def _of_windows(asked: DriveQuery, progress: bool) -> Iterator[tuple[DriveQuery,
             yield asked, Seen(whole, scorer.rows(first + part).cpu())
 
 
-def _mass(posterior: Tensor) -> Tensor:
-    return normalised(PlaceSmoother.folded(posterior.cpu().double()))[:, :-1]
+def _mass(posterior: Tensor, places: int) -> Tensor:
+    return normalised(folded(posterior.cpu().double(), places))[:, :-1]
 
 
 def doubt(own: Tensor) -> Tensor:

@@ -14,9 +14,10 @@ from typing_extensions import Self
 from dejavu_torch.memory import is_plain, without_autocast
 from dejavu_torch.places.layout import ROUTE, Layout
 from dejavu_torch.places.states import States
-from dejavu_torch.recognition.motion import MIN_PROBABILITY, Motion, Rates, checked_rates, logits
+from dejavu_torch.recognition.engine import MIN_PROBABILITY, Motion, Rates
+from dejavu_torch.recognition.motion import AlongRoute, checked_rates, logits
 from dejavu_torch.recognition.online import Learned
-from dejavu_torch.recognition.plane import SHARP, Followed, PlaneMotion
+from dejavu_torch.recognition.plane import SHARP, ByPlace, Followed
 from dejavu_torch.recognition.sequence import each
 from dejavu_torch.types import InputError, SequenceModel, expect
 
@@ -265,7 +266,7 @@ class PlaceFilter(SequenceModel):
         parts.append(rest)
         return answers, scores[:due], torch.cat(parts)
 
-    def _message(self, motion: Motion | PlaneMotion, likelihoods: Tensor, left_out: Sequence[int]) -> Tensor:
+    def _message(self, motion: Motion, likelihoods: Tensor, left_out: Sequence[int]) -> Tensor:
         """What the queries after the first one say of it, (R,N+1) -> (N+1,)."""
         message = torch.ones_like(likelihoods[0])
         for t in range(len(likelihoods) - 1, 0, -1):
@@ -292,7 +293,7 @@ class PlaceFilter(SequenceModel):
 
     def motion(
         self, like: Tensor, route_starts: Sequence[int] = (0,), learned: Learned | Followed | None = None
-    ) -> Motion | PlaneMotion:
+    ) -> Motion:
         """The transitions of a map, in the type of its scores (..., N)."""
         moves, (_, jump, leave) = (one.to(like).softmax(0) for one in (self.move_logits, self.rate_logits))
         moves = moves if learned is None else learned.moves_after(moves)
@@ -322,15 +323,15 @@ class PlaceFilter(SequenceModel):
         )
 
 
-def _along(layout: Layout, rates: Rates, places: int, route_starts: Sequence[int]) -> Motion:
+def _along(layout: Layout, rates: Rates, places: int, route_starts: Sequence[int]) -> AlongRoute:
     unknown = States(places, route_starts=tuple(route_starts))
-    return Motion(layout.states() if layout.places else unknown, rates)
+    return AlongRoute(layout.states() if layout.places else unknown, rates)
 
 
 # by the dimensions of a layout
-MOTIONS: Mapping[int, Callable[[Layout, Rates, int, Sequence[int]], Motion | PlaneMotion]] = {
+MOTIONS: Mapping[int, Callable[[Layout, Rates, int, Sequence[int]], Motion]] = {
     1: _along,
-    2: lambda layout, rates, *_: PlaneMotion(layout, rates),
+    2: lambda layout, rates, *_: ByPlace(layout, rates),
 }
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from functools import partial
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -11,13 +12,13 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from dejavu_torch.recognition.engine import Evidence, FittedPart, explained, folded
 from dejavu_torch.recognition.evidence import (
     MIN_SHARE,
     RankTable,
     Standardised,
     spacing_of,
 )
-from dejavu_torch.recognition.motion import Motion
 from dejavu_torch.recognition.scorer import Scorer
 from dejavu_torch.recognition.smoother import (
     CORRELATED,
@@ -26,7 +27,6 @@ from dejavu_torch.recognition.smoother import (
     SAMPLED,
     STRETCH,
     STRETCHES,
-    FittedPart,
     PlaceSmoother,
 )
 from dejavu_torch.text import progress_of
@@ -167,7 +167,7 @@ class LargeDrive:
         top = torch.zeros(count, best.shape[1])
         with progress_of("searching", self.queries, self.progress, "query") as update:
             for block in coarse.blocks(coarse.drive(rows, self.scorer.descriptors), starts):
-                mass = coarse.folded(block.posterior)[:, :-1]
+                mass = folded(block.posterior, best.shape[1])[:, :-1]
                 for looked, (start, stop) in zip(top, around, strict=True):
                     some = slice(max(0, start - block.first), max(0, stop - block.first))
                     if len(mass[some]):
@@ -238,7 +238,8 @@ class LargeDrive:
         z = window.z[some.start - window.start : some.stop - window.start].float()
         speaks, states = self.speaks[some] > 0, self.states.of(window.places)
         std = Standardised(z.nan_to_num(0, 0, 0), speaks, z.isfinite() | ~speaks[:, None])
-        return FittedPart(std, self.spacing.weight[some], self.spacing.still[some], states)
+        over = partial(self.smoother.motion, states)
+        return FittedPart(std, self.spacing.weight[some], self.spacing.still[some], over)
 
     @torch.no_grad()
     def __iter__(self) -> Iterator[tuple[int, Tensor, Tensor, Tensor]]:
@@ -248,8 +249,8 @@ class LargeDrive:
         rates = smoother.rates(self.means)
         for window in self.windows[::-1]:
             sample = self._sample(window, slice(window.start, window.stop))
-            model = smoother.values, smoother.separation, Motion(sample.states, rates)
-            (block,) = smoother.explained(sample, *model, len(sample.weight))
+            evidence = Evidence(smoother.values, smoother.separation, smoother.tempering)
+            (block,) = explained(sample, evidence, sample.over(rates), len(sample.weight))
             own = slice(window.first - window.start, window.last - window.start)
             z = window.z[own].float() * self.spread[window.first : window.last, None]
             scores = self.means[window.places] - z + self.mean[window.first : window.last, None]

@@ -3,40 +3,25 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Iterator, Sequence
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from dejavu_torch.maps.compiling import Floats, Kernel, floats_of
 from dejavu_torch.places.states import States
+from dejavu_torch.recognition import loops
+from dejavu_torch.recognition.engine import MIN_PROBABILITY, Block, Counts, Motion, Rates
+from dejavu_torch.recognition.loops import Route
 from dejavu_torch.types import InputError
 
-MIN_PROBABILITY = 1e-30  # a probability of 0, with a finite gradient
+WORTH_COMPILING = 2**17  # queries x states that torch takes longer for than numba does to load
 
 
-class Rates(NamedTuple):
-    """Probabilities of a step, as tensors: moves (..., V+1) add up to 1; jump, leave and enter (...)."""
-
-    moves: Tensor
-    jump: Tensor
-    leave: Tensor
-    enter: Tensor
-
-
-class Counts(NamedTuple):
-    """Expected numbers of steps: moves (V+1,); jump, leave, enter, and staying off the map, each ()."""
-
-    moves: Tensor
-    jump: Tensor
-    leave: Tensor
-    enter: Tensor
-    absent: Tensor
-
-
-class Motion:
-    """A step of a hidden Markov model, and its transpose.
+class AlongRoute(Motion):
+    """A step along routes, in one or two directions of travel.
 
     A camera at a place moves on by 0 to V places, with turning round before, jumps to any place, or leaves
     the map; moving past the end of a route leaves it too. Off the map, it enters at any place.
@@ -44,10 +29,11 @@ class Motion:
     Rates of several drives (C,) go with beliefs (C,S); `best_moved` and `counts` take those of one.
     """
 
+    directions = 2
+
     def __init__(self, states: States, rates: Rates) -> None:
-        self.states, self.rates = states, rates
+        super().__init__(states, rates)
         _, jump, leave, enter = rates
-        self.each = states.share / max(1, states.directions * states.places)
         self.moves = ((1 - jump - leave)[..., None] * rates.moves)[..., None, None].unbind(-3)
         last, taken = states.places - 1, rates.moves.new_zeros(states.directions, states.places)
         ways: list[tuple[int, int, int, float]] = []
@@ -129,18 +115,72 @@ class Motion:
         return belief @ goes if goes.ndim == 1 else torch.linalg.vecdot(belief, goes)
 
     def moved(self, belief: Tensor) -> Tensor:
-        """The belief before the next query."""
         on, _ = self._split(belief)
         moved = self._by_all_moves(self._turned(on), back=False).flatten(-2)
         anywhere, off = (self._share(belief, goes)[..., None] for goes in (self.free, self.gone))
         return torch.cat([moved + anywhere * self.each, off], -1)
 
     def expected(self, message: Tensor) -> Tensor:
-        """What a message of the next query says of the state before: the transpose of `moved`."""
         on, off = self._split(message)
         moved = self._turned(self._by_all_moves(on, back=True)).flatten(-2)
         anywhere = self.each * message[..., :-1].sum(-1, keepdim=True)
         return F.pad(moved, (0, 1)) + (anywhere * self.free + off * self.gone)
+
+    def ahead(self, belief: Tensor, likelihood: Tensor, still: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        found = self._run(loops.ahead, belief, likelihood, still)
+        if found is None:
+            return super().ahead(belief, likelihood, still)
+        before, totals, belief = found
+        return before, totals.log(), belief
+
+    def behind(self, message: Tensor, likelihood: Tensor, still: Tensor) -> tuple[Tensor, Tensor]:
+        found = self._run(loops.behind, message, likelihood, still)
+        return super().behind(message, likelihood, still) if found is None else (found[0], found[2])
+
+    def masses(self, block: Block) -> tuple[Tensor, Tensor]:
+        if block.before.numel() >= WORTH_COMPILING:
+            each = block.before, block.likelihood, block.after
+            found = [floats_of(one.reshape(-1, one.shape[-1])) for one in each]
+            if all(one is not None for one in found) and (kernel := loops.masses()) is not None:
+                shape = *block.before.shape[:-1], self.states.places
+                own, others = np.empty((2, math.prod(shape[:-1]), shape[-1]), np.float32)
+                kernel(*found, own, others)
+                return torch.from_numpy(own).view(shape), torch.from_numpy(others).view(shape)
+        return super().masses(block)
+
+    def _run(
+        self, loop: Callable[[], Kernel | None], start: Tensor, likelihood: Tensor, still: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor] | None:
+        """What a loop finds, (..., B, S), (..., B) and (..., S); None if torch has to compute it."""
+        *drives, queries, states = likelihood.shape
+        if likelihood.numel() < WORTH_COMPILING:
+            return None
+        count = math.prod(drives)
+        each = (torch.stack(self.moves, -3)[..., 0, 0], self.free, self.gone)
+        rates = (one.reshape(-1, one.shape[-1]).expand(count, -1) for one in each)
+        start = start.expand(*drives, states).reshape(count, states).clone()
+        arrays = self._readable(start, likelihood.reshape(count, queries, states), *rates)
+        if arrays is None or (kernel := loop()) is None:
+            return None
+        (own, seen, *motion), route = arrays
+        out, totals = np.empty_like(seen), np.empty(seen.shape[:2], np.float32)
+        rests = still.reshape(count, queries).contiguous().numpy()
+        kernel(own, seen, rests, (*motion, self.each), route, out, totals)
+        shapes = ((out, likelihood.shape), (totals, still.shape), (own, (*drives, states)))
+        before, log, last = (torch.from_numpy(one).view(shape) for one, shape in shapes)
+        return before, log, last
+
+    def _readable(self, *tensors: Tensor) -> tuple[list[Floats], Route] | None:
+        """The data of tensors, and what the loops read of the route; None if torch has to compute."""
+        keep = tensors[0].new_ones(self.lost.shape[-2:]) if self.keep is None else self.keep
+        links = [link[:3] for link in self.linked]
+        shares = keep.new_tensor([link[3] for link in self.linked])
+        found = [floats_of(one) for one in (*tensors, keep, shares)]
+        known = [one for one in found if one is not None]
+        if len(known) < len(found):
+            return None
+        linked = np.array(links, np.int64).reshape(-1, 3)
+        return known[:-2], (known[-2], linked, known[-1], self.states.turn, self.keep is None)
 
     def best_moved(self, log: Tensor) -> Tensor:
         """Log probabilities of the best way to each state in a step, from those before it (Viterbi)."""
@@ -169,37 +209,39 @@ class Motion:
             moved[..., row, to] = torch.maximum(moved[..., row, to], linked)
         return moved
 
-    def anywhere(self) -> Tensor:
-        """The belief before the first query: on or off the map in the equilibrium of leaving and entering."""
-        both = (self.rates.leave + self.rates.enter).clamp(min=MIN_PROBABILITY)
-        off = (self.rates.leave / both).clamp(max=0.5)
-        on = 1 - off[..., None]
-        places = self.states.directions * self.states.places
-        return torch.cat([(on * self.each).expand(*off.shape, places), 1 - on * self.states.share], -1)
-
     def counts(self, before: Tensor, after: Tensor) -> Counts:
-        """Expected numbers of steps (the E-step of Baum and Welch).
-
-        Args:
-            before: (..., S) beliefs given all queries so far. after: (..., S) messages of the next query and
-                all after it, of any scale.
-        """
         (on, off), (on_after, off_after) = self._split(before), self._split(after)
         start, off, off_after = self._turned(on), off[..., 0], off_after[..., 0]
         total = before[..., :-1].sum(-1)
         mean = torch.lerp(off_after, after[..., :-1].mean(-1), self.states.share)
         _, jump, leave, enter = self.rates
-        kinds = []
-        shifts = self._shifts(on_after, back=True)
-        for move, reach, shifted in zip(self.moves, self.reach, shifts, strict=True):
-            lost = start.flatten(-2) @ (1 - reach).flatten()
-            kinds.append(move[0, 0] * ((start * shifted).sum((-1, -2)) + off_after * lost))
+        lost, kinds = torch.stack([(1 - reach).flatten() for reach in self.reach]), []
+        if (found := self._counted(before, after, lost)) is not None:
+            kinds = [move[0, 0] * one for move, one in zip(self.moves, found.unbind(-1), strict=True)]
+        else:
+            shifts = self._shifts(on_after, back=True)
+            for move, gone, shifted in zip(self.moves, lost, shifts, strict=True):
+                gone = off_after * (start.flatten(-2) @ gone)
+                kinds.append(move[0, 0] * ((start * shifted).sum((-1, -2)) + gone))
         kinds += [jump * total * mean, leave * total * off_after]
         kinds += [enter * off * mean, (1 - enter) * off * off_after]
         each = torch.stack(kinds, -1).flatten(0, -2)
         total = each.sum(-1, keepdim=True)
         counts = torch.where(total > 0, each / total.clamp(min=MIN_PROBABILITY), 0).sum(0)
         return Counts(counts[:-4], *counts[-4:])
+
+    def _counted(self, before: Tensor, after: Tensor, lost: Tensor) -> Tensor | None:
+        """The weight of each move without its probability, (..., V+1), by a loop of `loops`."""
+        if before.numel() < WORTH_COMPILING:
+            return None
+        rows = (one.reshape(-1, one.shape[-1]) for one in (before, after))
+        arrays = self._readable(*rows, lost)
+        if arrays is None or (kernel := loops.counted()) is None:
+            return None
+        (own, later, away), route = arrays
+        out = np.empty((len(own), len(away)), np.float32)
+        kernel(own, later, away, route, out)
+        return torch.from_numpy(out).view(*before.shape[:-1], -1)
 
 
 def logits(*probabilities: float) -> Tensor:

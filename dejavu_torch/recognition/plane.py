@@ -10,7 +10,9 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from dejavu_torch.places.layout import Layout
-from dejavu_torch.recognition.motion import MIN_PROBABILITY, Counts, Rates
+from dejavu_torch.places.rectangles import boxes
+from dejavu_torch.places.states import States
+from dejavu_torch.recognition.engine import MIN_PROBABILITY, Counts, Motion, Rates
 
 # places around one whose mass an answer is chosen by, at most, and that of a drive at least, by the
 # dimensions of a layout
@@ -19,55 +21,101 @@ PERSISTENCE = 0.95  # of learned moves from one query to the next
 MOVES_GIVEN = 5.0  # queries that the given moves count as
 
 
-class Steps(NamedTuple):
-    """A step over an area, and its transpose, of the mass of windows (R,C) and that of being off it ().
+class PlaneMotion(Motion):
+    """A step over an area, by rows and columns; a move over the border leaves it. States are the rows and
+    columns of the plane, in which places may lie in another order and leave gaps.
 
-    kernel: (2 V + 1, 2 V + 1), probabilities of a move by rows and columns, `jump` and `leave` taken off.
-    jump, leave, enter: see `Motion`; a move over the border leaves the area. inside: (R,C), see `Layout`.
+    Args:
+        rates: with moves (M,), M = (2 V + 1)^2, by rows and columns, see `Followed`.
     """
 
-    kernel: Tensor
-    jump: Tensor
-    leave: Tensor
-    enter: Tensor
-    inside: Tensor | None = None
+    def __init__(self, layout: Layout, rates: Rates) -> None:
+        super().__init__(States(layout.places), rates)
+        self.layout, side = layout, math.isqrt(len(rates.moves))
+        self.reach, self.inside = side // 2, None
+        self.kernel = (1 - rates.jump - rates.leave) * rates.moves.view(1, 1, side, side)
+        self.even = self.kernel.new_tensor(1 / (layout.rows * layout.columns))
+        if layout.inside is not None:
+            self.inside = layout.inside.to(self.kernel)
+            self.even = (self.inside / self.inside.sum()).flatten()
 
-    def moved(self, on: Tensor, off: Tensor) -> tuple[Tensor, Tensor]:
-        """The belief before the next query."""
-        total = on.sum()
-        goes = F.conv2d(on[None, None], self.kernel.flip(0, 1)[None, None], padding=self.reach)[0, 0]
-        goes = goes if self.inside is None else goes * self.inside
-        lost = self.kernel.sum() * total - goes.sum()
-        anywhere = (self.jump * total + self.enter * off) * self.even(on)
-        return goes + anywhere, (1 - self.enter) * off + self.leave * total + lost
+    def moved(self, belief: Tensor) -> Tensor:
+        on, off = self._split(belief)
+        goes = F.conv2d(on[:, None], self.kernel.flip(2, 3), padding=self.reach)[:, 0]
+        goes = (goes if self.inside is None else goes * self.inside).flatten(1)
+        total = on.sum((1, 2))[:, None]
+        lost = self.kernel.sum() * total - goes.sum(1, keepdim=True)
+        anywhere = (self.rates.jump * total + self.rates.enter * off) * self.even
+        off = (1 - self.rates.enter) * off + self.rates.leave * total + lost
+        return torch.cat([goes + anywhere, off], 1).view_as(belief)
 
-    def expected(self, on: Tensor, off: Tensor) -> tuple[Tensor, Tensor]:
-        """What a message of the next query says of the state before."""
-        goes = F.conv2d(self._bordered(on, off), self.kernel[None, None])[0, 0]
-        anywhere = (on * self.even(on)).sum()
-        back = goes + self.jump * anywhere + self.leave * off
-        return back, self.enter * anywhere + (1 - self.enter) * off
+    def expected(self, message: Tensor) -> Tensor:
+        on, off = self._split(message)
+        _, jump, leave, enter = self.rates
+        goes = F.conv2d(self._bordered(on, off), self.kernel)[:, 0].flatten(1)
+        anywhere = (on.flatten(1) * self.even).sum(1, keepdim=True)
+        back = goes + jump * anywhere + leave * off
+        return torch.cat([back, enter * anywhere + (1 - enter) * off], 1).view_as(message)
 
-    def pairs(self, before: Tensor, on: Tensor, off: Tensor) -> Tensor:
-        """Of each move (2 V + 1, 2 V + 1), the weight of belief before (R,C) and message after it."""
-        weight: Tensor = self.kernel * F.conv2d(self._bordered(on, off), before[None, None])[0, 0]
-        return weight
+    def anywhere(self) -> Tensor:
+        off = (self.rates.leave / (self.rates.leave + self.rates.enter).clamp(min=MIN_PROBABILITY)).clamp(
+            max=0.5
+        )
+        return torch.cat([((1 - off) * self.even).expand(self.layout.rows * self.layout.columns), off[None]])
 
-    @property
-    def reach(self) -> int:
-        """V."""
-        return len(self.kernel) // 2
+    def counts(self, before: Tensor, after: Tensor) -> Counts:
+        (on, off), (later, absent) = self._split(before), self._split(after)
+        _, jump, leave, enter = self.rates
+        around = self._bordered(later, absent).transpose(0, 1)
+        pairs = self.kernel[0] * F.conv2d(around, on[:, None], groups=len(on))[0]  # (B, 2 V + 1, 2 V + 1)
+        total, mean = on.sum((1, 2))[:, None], (later.flatten(1) * self.even).sum(1, keepdim=True)
+        rest = [jump * total * mean, leave * total * absent, enter * off * mean, (1 - enter) * off * absent]
+        each = torch.cat([pairs.flatten(1), *rest], 1)
+        each = (each / each.sum(1, keepdim=True).clamp(min=MIN_PROBABILITY)).sum(0)
+        return Counts(each[:-4], *each[-4:])
 
-    def even(self, on: Tensor) -> Tensor:
-        """The mass of each window if all have the same, (R,C), or () if all rows and columns are windows."""
-        return on.new_tensor(1 / on.numel()) if self.inside is None else self.inside / self.inside.sum()
+    def wide(self, places: Tensor, off: float) -> Tensor:
+        plane = self.layout.as_plane(places.flatten(0, -2)).flatten(1)
+        return F.pad(plane, (0, 1), value=off).view(*places.shape[:-1], -1)
+
+    def folded(self, mass: Tensor) -> Tensor:
+        on, off = self._split(mass)
+        return torch.cat([self.layout.by_place(on), off], 1).view(*mass.shape[:-1], -1)
+
+    def near(self, mass: Tensor, radius: int) -> Tensor:
+        plane = self.layout.as_plane(mass.flatten(0, -2))
+        return self.layout.by_place(boxes(plane, radius)).clamp(0, 1).view_as(mass)
+
+    def _split(self, states: Tensor) -> tuple[Tensor, Tensor]:
+        """The plane (B,R,C), and being off it (B,1)."""
+        states = states.reshape(-1, states.shape[-1])
+        return states[:, :-1].unflatten(1, (self.layout.rows, self.layout.columns)), states[:, -1:]
 
     def _bordered(self, on: Tensor, off: Tensor) -> Tensor:
-        """A message, with that of being off the area around it, (1, 1, R + 2 V, C + 2 V)."""
+        """Messages, with those of being off the area around them, (B, 1, R + 2 V, C + 2 V)."""
+        off = off[..., None]
         on = on if self.inside is None else torch.where(self.inside > 0, on, off)
-        around = off.expand(tuple(side + 2 * self.reach for side in on.shape)).clone()
-        around[self.reach : self.reach + len(on), self.reach : self.reach + on.shape[1]] = on
-        return around[None, None]
+        return (F.pad(on - off, (self.reach,) * 4) + off)[:, None]
+
+
+class ByPlace(PlaneMotion):
+    """The same for a filter: states are the places, in order, and being off the area."""
+
+    def moved(self, belief: Tensor) -> Tensor:
+        return self.folded(super().moved(self._wide(belief)))
+
+    def expected(self, message: Tensor) -> Tensor:
+        return self.folded(super().expected(self._wide(message)))
+
+    def anywhere(self) -> Tensor:
+        return self.folded(super().anywhere())
+
+    def counts(self, before: Tensor, after: Tensor) -> Counts:
+        return super().counts(self._wide(before), self._wide(after))
+
+    def _wide(self, states: Tensor) -> Tensor:
+        plane = self.layout.as_plane(states[..., :-1].reshape(-1, self.layout.places)).flatten(1)
+        return torch.cat([plane.view(*states.shape[:-1], -1), states[..., -1:]], -1)
 
 
 class Followed(NamedTuple):
@@ -99,56 +147,6 @@ class Followed(NamedTuple):
         kernel = given[rings(len(given) - 1).to(given.device).flatten()]
         moves = MOVES_GIVEN * kernel / kernel.sum() + self.moves
         return moves / moves.sum()
-
-
-class PlaneMotion:
-    """`Motion` over an area, for a filter. Beliefs are (N+1,): the places, then being off the area.
-
-    Args:
-        rates: with moves (M,) by rows and columns, see `Followed`.
-    """
-
-    def __init__(self, layout: Layout, rates: Rates) -> None:
-        self.layout, self.rates = layout, rates
-        side = math.isqrt(len(rates.moves))
-        kernel = (1 - rates.jump - rates.leave) * rates.moves.view(side, side)
-        self.steps = Steps(kernel, rates.jump, rates.leave, rates.enter, inside_of(layout, kernel))
-
-    def moved(self, belief: Tensor) -> Tensor:
-        """The belief before the next query."""
-        return self._joined(*self.steps.moved(*self._split(belief)))
-
-    def expected(self, message: Tensor) -> Tensor:
-        """What a message of the next query says of the state before: the transpose of `moved`."""
-        return self._joined(*self.steps.expected(*self._split(message)))
-
-    def anywhere(self) -> Tensor:
-        """The belief before the first query, see `Motion.anywhere`."""
-        _, _, leave, enter = self.rates
-        off = (leave / (leave + enter).clamp(min=MIN_PROBABILITY)).clamp(max=0.5)
-        return torch.cat([((1 - off) / self.layout.places).expand(self.layout.places), off[None]])
-
-    def counts(self, before: Tensor, after: Tensor) -> Counts:
-        """Expected numbers of steps, see `Motion.counts`, of one step: (1,N+1)."""
-        (on, off), (later, absent) = self._split(before[0]), self._split(after[0])
-        _, jump, leave, enter = self.rates
-        total, mean = on.sum(), (later * self.steps.even(later)).sum()
-        rest = [jump * total * mean, leave * total * absent, enter * off * mean, (1 - enter) * off * absent]
-        each = torch.cat([self.steps.pairs(on, later, absent).flatten(), torch.stack(rest)])
-        each = each / each.sum().clamp(min=MIN_PROBABILITY)
-        return Counts(each[:-4], *each[-4:])
-
-    def _split(self, state: Tensor) -> tuple[Tensor, Tensor]:
-        return self.layout.as_plane(state[None, :-1])[0], state[-1]
-
-    def _joined(self, on: Tensor, off: Tensor) -> Tensor:
-        return torch.cat([self.layout.by_place(on[None])[0], off[None]])
-
-
-def inside_of(layout: Layout, like: Tensor) -> Tensor | None:
-    """`Layout.inside`, in the type of other numbers."""
-    inside = layout.inside
-    return None if inside is None else inside.to(like)
 
 
 def rings(reach: int) -> Tensor:

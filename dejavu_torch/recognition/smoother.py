@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from typing import NamedTuple
 
 import torch
@@ -12,26 +13,31 @@ from torch import Tensor, nn
 from typing_extensions import Self
 
 from dejavu_torch.places.layout import Layout
-from dejavu_torch.places.rectangles import window_sums
 from dejavu_torch.places.states import Link, States
+from dejavu_torch.recognition.engine import (
+    NUMBERS_AT_ONCE,
+    Block,
+    Counts,
+    Evidence,
+    Fit,
+    FittedPart,
+    Motion,
+    Rates,
+    folded,
+    learn,
+    nats,
+    sweep,
+)
 from dejavu_torch.recognition.evidence import (
     RankTable,
     Spacing,
-    Standardised,
     place_means,
     spacing_of,
     speaking,
     standardised,
 )
 from dejavu_torch.recognition.filter import near_scores
-from dejavu_torch.recognition.motion import (
-    MIN_PROBABILITY,
-    Counts,
-    Motion,
-    Rates,
-    checked_rates,
-    logits,
-)
+from dejavu_torch.recognition.motion import AlongRoute, checked_rates, logits
 from dejavu_torch.recognition.taken import Singly, moves_along
 from dejavu_torch.types import Facts, InputError, SequenceModel, expect
 
@@ -39,8 +45,6 @@ MOVES = (0.2, 0.5, 0.2, 0.05, 0.02, 0.015, 0.015)
 SLOW = (0.67, 0.25, 0.05, 0.01, 0.01, 0.005, 0.005)  # of which EM starts if that at one place a query fails
 FAST = (0.05, 0.1, 0.2, 0.3, 0.2, 0.1, 0.05)
 RATES = 0.001, 0.001, 0.01  # jump, leave, enter
-RADIUS = 5  # places around a right one whose scores are not counted as wrong
-ROUNDS = 5  # of expectation-maximisation
 MOVE_SHARE = 0.1  # of the queries: the weight of the prior of the moves
 RATE_COUNTS, ENTER_COUNTS = 200.0, 50.0  # steps that the priors of jump and leave, and of enter, count as
 SHARPENED = 0.6  # tau' = SHARPENED tau
@@ -55,58 +59,8 @@ CORRELATED = 4  # correlation times in a stretch, at least
 # one place a query
 OTHER_SPEED, PER_QUERY, CLEARLY = 30.0, 0.1, 5.0
 WHOLE = "a smoother has to know the whole drive; expected a PlaceFilter, or a SequenceMatcher"
-NUMBERS_AT_ONCE = 2**20  # numbers of a block of queries and states, which stays in the cache
-HELD = 2**25  # of all of them, up to which they are kept for the way back
 
 Rows = Callable[[Tensor], Tensor]  # numbers of queries (B,) -> their scores (B,N)
-Likelihood = Callable[[int, int], Tensor]  # of the queries [first, last), (..., B, S)
-
-
-class Block(NamedTuple):
-    """Consecutive queries from `first` on, of a sweep: (..., B, S) each, as `States` numbers them.
-
-    before: beliefs given the queries before each. likelihood: of each query, 1 off the map. after: messages
-    of the queries after each, of any scale. log: (..., B), likelihood of each query given those before.
-    """
-
-    first: int
-    before: Tensor
-    likelihood: Tensor
-    after: Tensor
-    log: Tensor
-
-    @property
-    def posterior(self) -> Tensor:
-        return normalised(self.before * self.likelihood * self.after)
-
-
-class FittedPart(NamedTuple):
-    """Stretches of a drive that a smoother is fitted to: (..., L, N) at the places of `states`; weight and
-    still (..., L) as in `Spacing`."""
-
-    std: Standardised
-    weight: Tensor
-    still: Tensor
-    states: States
-
-    def part(self, first: int, last: int) -> FittedPart:
-        """The queries [first, last) of each stretch."""
-        std = self.std.map(lambda column: column.narrow(self.weight.ndim - 1, first, last - first))
-        return FittedPart(std, self.weight[..., first:last], self.still[..., first:last], self.states)
-
-
-class Found(NamedTuple):
-    """What expectation-maximisation found.
-
-    log: nats by which the model beats being off the map. held: likewise, with jumps, and ways off the
-    map, as rare as by the prior.
-    """
-
-    rates: Rates
-    separation: float
-    values: Tensor  # of the rank table
-    log: float
-    held: float
 
 
 class PlaceSmoother(SequenceModel):
@@ -129,6 +83,7 @@ class PlaceSmoother(SequenceModel):
         threshold: accept a match if its score is below; None leaves it to `DejaVu.acceptance`.
         links: further steps (from, to, probability) in place of that to the next place.
         loop: the last place leads to the first one.
+        motion: a kind of motion of one's own, which is made of `States` and `Rates`.
 
     Shape: scores (..., Q, N) -> (..., Q, N), -log of a probability in nats. Descriptors (Q,K), where given,
         tell how the queries depend on each other; else the scores tell it.
@@ -167,6 +122,7 @@ class PlaceSmoother(SequenceModel):
         threshold: float | None = None,
         links: Sequence[Link] = (),
         loop: bool = False,
+        motion: type[Motion] = AlongRoute,
     ) -> None:
         super().__init__()
         moves = checked_rates(moves, jump, leave, enter)
@@ -183,7 +139,7 @@ class PlaceSmoother(SequenceModel):
         self.enter_logit = nn.Parameter(logits(enter)[0] - logits(1 - enter)[0])
         self.turn, self.separation, self.tempering = turn, float(separation), float(tempering)
         self.within, self.threshold = within, threshold
-        self.links, self.loop = tuple(links), loop
+        self.links, self.loop, self.motion = tuple(links), loop, motion
         self.map_links: tuple[Link, ...] = ()  # those of the map
         self.removed = 1.0  # share of each place's mean score that is removed
         self.log_likelihood: float | None = None  # nats above being off the map throughout, as fitted
@@ -230,7 +186,7 @@ class PlaceSmoother(SequenceModel):
         Shape: (Q,N), (Q,K) or None -> (Q,N+1), off the map last; rows add up to 1.
         """
         blocks = self.blocks(self.drive(scores, descriptors), route_starts)
-        parts = [self.folded(block.posterior) for block in blocks]
+        parts = [folded(block.posterior, scores.shape[1]) for block in blocks]
         return torch.cat(parts[::-1]) if parts else scores.new_zeros(0, scores.shape[1] + 1)
 
     def log_evidence(
@@ -249,8 +205,10 @@ class PlaceSmoother(SequenceModel):
     ) -> Tensor:
         """The most probable sequence of places (Viterbi): (Q,N) -> (Q,) int64, -1 off the map."""
         drive = self.drive(scores, descriptors)
-        motion, still = self.motion(scores.shape[1], route_starts, drive.means), drive.spacing.still
-        log = self.wide(drive.log_likelihood(torch.arange(len(scores))), 0.0)
+        motion, still = self.steps(scores.shape[1], route_starts, drive.means), drive.spacing.still
+        if not isinstance(motion, AlongRoute):
+            raise InputError(f"the motion is a {type(motion).__name__}; expected one along a route")
+        log = motion.wide(drive.log_likelihood(torch.arange(len(scores))), 0.0)
         best = [motion.anywhere().log() + log[0]] if len(scores) else []
         for t in range(1, len(scores)):
             best.append((best[-1] if still[t] else motion.best_moved(best[-1])) + log[t])
@@ -268,9 +226,9 @@ class PlaceSmoother(SequenceModel):
         place = torch.where(state < n, state, 2 * n - 1 - state)
         return torch.where(state < 2 * n, place, -1)
 
-    def motion(self, places: int, route_starts: Sequence[int], like: Tensor) -> Motion:
+    def steps(self, places: int, route_starts: Sequence[int], like: Tensor) -> Motion:
         """The transitions of a map, in the type of its scores."""
-        return Motion(self.states(places, route_starts), self.rates(like))
+        return self.motion(self.states(places, route_starts), self.rates(like))
 
     def rates(self, like: Tensor) -> Rates:
         moves, (_, jump, leave) = (one.to(like).softmax(0) for one in (self.move_logits, self.rate_logits))
@@ -285,18 +243,7 @@ class PlaceSmoother(SequenceModel):
             if not (0 <= first < places and 0 <= second < places and 0 <= share <= 1):
                 seen = f"the link {(first, second, share)} on {places} places"
                 raise InputError(f"{seen}; expected two of these places and a probability")
-        return States(places, 2, tuple(route_starts), links, self.turn)
-
-    @staticmethod
-    def wide(places: Tensor, off: float) -> Tensor:
-        """Numbers of the places (..., N) for all states (..., 2 N + 1)."""
-        return torch.cat([places, places.flip(-1), places.new_full((*places.shape[:-1], 1), off)], -1)
-
-    @staticmethod
-    def folded(states: Tensor) -> Tensor:
-        """Mass of all states (..., 2 N + 1) -> of the places in either direction, and off the map."""
-        n = (states.shape[-1] - 1) // 2
-        return torch.cat([states[..., :n] + states[..., n:-1].flip(-1), states[..., -1:]], -1)
+        return States(places, self.motion.directions, tuple(route_starts), links, self.turn)
 
     def drive(
         self, scores: Tensor | Rows, descriptors: Tensor | None = None, spacing: Spacing | None = None
@@ -367,7 +314,7 @@ class PlaceSmoother(SequenceModel):
         ranks = RankTable()
         ranks.add(std.z, std.only((weight[picked] * std.speaks)[..., None].expand_as(std.z), 0))
         states = self.states(places, route_starts)
-        samples = [FittedPart(std, weight[picked], still[picked], states)]
+        samples = [FittedPart(std, weight[picked], still[picked], partial(self.motion, states))]
         return self.taught(samples, ranks, spacing, means)
 
     def forgetful(self) -> Self:
@@ -412,71 +359,16 @@ class PlaceSmoother(SequenceModel):
 
     def _fitted(
         self, samples: Sequence[FittedPart], ranks: RankTable, start: Sequence[float], moved: float
-    ) -> Found:
+    ) -> Fit:
         """Expectation-maximisation from a start of the moves, which is their prior; `moved` queries move."""
-        z = samples[0].std.z
-        prior, separation = z.new_tensor(start), self.first_separation
-        rates = Rates(prior, *(prior.new_tensor(rate) for rate in self.rate_prior))
-        table = ranks
-        for _ in range(ROUNDS):
-            values, table, sums, counts = table.values, RankTable(ranks.counts), z.new_zeros(2), []
-            for sample in samples:
-                motion, later = Motion(sample.states, rates), None
-                for block in self.explained(sample, values, separation, motion):
-                    first, last = block.first, block.first + block.log.shape[-1]
-                    std, weight, *_ = sample.part(first, last)
-                    shares = (weight * std.speaks)[..., None]
-                    near = near_mass(self.folded(block.posterior)[..., :-1], RADIUS)
-                    table.add(std.z, std.only(-shares * near, 0))  # right ones
-                    # without its own evidence, that of a query is not mistaken for that of its place
-                    others = self.folded(normalised(block.before * block.after))[..., :-1] * shares
-                    known = std.only(RankTable.look_up(values, std.z), 0)
-                    sums += torch.stack([(others * known).sum(), others.sum()])
-                    belief, after = block.before * block.likelihood, block.likelihood * block.after
-                    later = after[..., 1:, :] if later is None else torch.cat([after[..., 1:, :], later], -2)
-                    pair = belief[..., : later.shape[-2], :], later
-                    still = sample.still[..., first + 1 : last + 1]
-                    if still.any():
-                        pair = pair[0][~still], pair[1][~still]
-                    counts.append(motion.counts(*pair))
-                    later = after[..., :1, :]
-            separation = max(MIN_SEPARATION, float(sums[0] / sums[1].clamp(min=MIN_PROBABILITY)))
-            total = Counts(*(torch.stack(kind).sum(0) for kind in zip(*counts, strict=True)))
-            rates = updated_rates(total, prior * (MOVE_SHARE * moved), self.rate_prior)
-        jump, leave, _ = self.rate_prior
-        rare = rates._replace(jump=prior.new_tensor(jump), leave=prior.new_tensor(leave))
-        nats = (self._nats(samples, table.values, separation, one) for one in (rates, rare))
-        return Found(rates, separation, table.values, *nats)
-
-    def _nats(self, samples: Sequence[FittedPart], values: Tensor, separation: float, rates: Rates) -> float:
-        """By how much the model beats being off the map."""
-        total = 0.0
-        for sample in samples:
-            *lead, queries = sample.weight.shape
-            size = max(1, NUMBERS_AT_ONCE // (math.prod(lead) * (2 * sample.states.places + 1)))
-            likelihood = self._likelihood(sample, values, separation)
-            parts = forward(Motion(sample.states, rates), likelihood, range(0, queries, size), sample.still)
-            total += float(sum(part.log.sum() for part in parts))
-        return total
-
-    def explained(
-        self, sample: FittedPart, values: Tensor, separation: float, motion: Motion, size: int | None = None
-    ) -> Iterator[Block]:
-        """What follows from a sample, in blocks of `size` queries, the last first."""
-        *lead, queries = sample.weight.shape
-        if size is None:
-            size = max(1, NUMBERS_AT_ONCE // (math.prod(lead) * (2 * sample.states.places + 1)))
-        yield from sweep(motion, self._likelihood(sample, values, separation), queries, sample.still, size)
-
-    def _likelihood(self, sample: FittedPart, values: Tensor, separation: float) -> Likelihood:
-        """The likelihoods of a sample."""
-
-        def likelihood(first: int, last: int) -> Tensor:
-            std, weight, *_ = sample.part(first, last)
-            log = log_likelihood(values, std, weight, separation, self.tempering)
-            return self.wide(log.exp(), 1.0)
-
-        return likelihood
+        prior = samples[0].std.z.new_tensor(start)
+        rare = [prior.new_tensor(rate) for rate in self.rate_prior]
+        again = partial(updated_rates, prior=prior * (MOVE_SHARE * moved), rates=self.rate_prior)
+        evidence = self.first_separation, MIN_SEPARATION, self.tempering
+        rates, separation, values = learn(samples, ranks, Rates(prior, *rare), evidence, again)
+        found = Evidence(values, separation, self.tempering)
+        each = (nats(samples, found, one) for one in (rates, rates._replace(jump=rare[0], leave=rare[1])))
+        return Fit(rates, separation, values, *each)
 
     @torch.no_grad()
     def settled(self) -> Facts:
@@ -524,7 +416,7 @@ class Drive(NamedTuple):
         """Log likelihood of the places for some queries, 0 being off the map: (B,) -> (B,N)."""
         std = standardised(self.rows(numbers), self.means)
         weight = self.spacing.weight.cpu()[numbers].to(std.z)
-        return log_likelihood(self.values, std, weight, self.separation, self.tempering)
+        return Evidence(self.values, self.separation, self.tempering)(std, weight)
 
 
 def blocks_together(
@@ -537,13 +429,15 @@ def blocks_together(
     if size is None:
         size = max(1, math.isqrt(queries), NUMBERS_AT_ONCE // (len(drives) * (2 * places + 1)))
     rates = (smoother.rates(mean) for (smoother, _), mean in zip(drives, means, strict=True))
-    states = drives[0][0].states(places, route_starts)
-    motion = Motion(states, Rates(*map(torch.stack, zip(*rates, strict=True))))
+    first = drives[0][0]
+    motion = first.motion(
+        first.states(places, route_starts), Rates(*map(torch.stack, zip(*rates, strict=True)))
+    )
 
     def likelihood(first: int, last: int) -> Tensor:
         numbers = torch.arange(first, last)
         logs = torch.stack([drive.log_likelihood(numbers) for _, drive in drives])
-        return PlaceSmoother.wide(logs.exp(), 1.0)
+        return motion.wide(logs.exp(), 1.0)
 
     still = torch.stack([drive.spacing.still for _, drive in drives]).to(means[0].device)
     yield from sweep(motion, likelihood, queries, still, size)
@@ -571,79 +465,6 @@ def check_descriptors(descriptors: Tensor | None) -> Tensor:
     return descriptors
 
 
-def log_likelihood(
-    values: Tensor, std: Standardised, weight: Tensor, separation: float, tempering: float
-) -> Tensor:
-    """Tempered log likelihood ratio of scores (..., Q, N) by the `values` of a rank table, right ones beside
-    wrong ones: their normal scores are Gaussian with variance 1, and `separation` apart."""
-    ratio = RankTable.look_up((separation * values - separation**2 / 2) / tempering, std.z)
-    return std.only(ratio * (weight * std.speaks)[..., None], -math.inf)
-
-
-class Ahead(NamedTuple):
-    """As `Block`, of a pass forward alone; start: (..., S), the belief before any move to its first query."""
-
-    first: int
-    start: Tensor
-    before: Tensor
-    likelihood: Tensor
-    log: Tensor
-
-
-def forward(
-    motion: Motion,
-    likelihood: Likelihood,
-    numbers: range,
-    still: Tensor,
-    start: Tensor | None = None,
-) -> Iterator[Ahead]:
-    """Forward over the queries, in blocks.
-
-    Args:
-        likelihood: of the queries [first, last), (..., B, S). numbers: the first queries of all blocks.
-        still: (..., Q) bool, where nothing moves. start: the belief to begin with.
-    """
-    belief, stops = motion.anywhere() if start is None else start, bool(still.any())
-    for first in numbers:
-        start, like = belief, likelihood(first, min(first + numbers.step, numbers.stop))
-        before, totals = [], []
-        for t, seen in enumerate(like.unbind(-2), first):
-            if t:
-                moved = motion.moved(belief)
-                belief = torch.where(still[..., t, None], belief, moved) if stops else moved
-            before.append(belief.expand_as(seen))
-            joint = belief * seen
-            total = joint.sum(-1, keepdim=True)
-            belief = joint / total
-            totals.append(total)
-        yield Ahead(first, start, torch.stack(before, -2), like, torch.cat(totals, -1).log())
-
-
-def sweep(motion: Motion, likelihood: Likelihood, queries: int, still: Tensor, size: int) -> Iterator[Block]:
-    """Forward and backward over the queries, in blocks of `size`, which come from the last to the first;
-    see `forward`."""
-    numbers, stops, parts = range(0, queries, size), bool(still.any()), []
-    for part in forward(motion, likelihood, numbers, still):
-        held = part.first == numbers[-1] or part.before[..., 0, :].numel() * queries <= HELD
-        parts.append((part.first, part.start, part if held else None))
-    message: Tensor | None = None  # of the queries after a block, with their own likelihoods
-    while parts:
-        first, start, known = parts.pop()
-        part = known or next(forward(motion, likelihood, numbers[first // size :], still, start))
-        after = []
-        for t in reversed(range(part.first, part.first + part.before.shape[-2])):
-            seen = part.likelihood[..., t - part.first, :]
-            if message is None:
-                message = torch.ones_like(seen)
-            else:
-                moved = motion.expected(message)
-                message = torch.where(still[..., t + 1, None], message, moved) if stops else moved
-            after.append(message)
-            message = message * seen
-            message = message / message.amax(-1, keepdim=True)
-        yield Block(part.first, part.before, part.likelihood, torch.stack(after[::-1], -2), part.log)
-
-
 def updated_rates(counts: Counts, prior: Tensor, rates: Sequence[float] = RATES) -> Rates:
     """The M-step: counts with those of the priors, of moves (V+1,), and of jump, leave and enter."""
     moves, on = counts.moves + prior, counts.moves.sum() + counts.jump + counts.leave + RATE_COUNTS
@@ -654,17 +475,6 @@ def updated_rates(counts: Counts, prior: Tensor, rates: Sequence[float] = RATES)
         (counts.leave + RATE_COUNTS * leave) / on,
         (counts.enter + ENTER_COUNTS * enter) / (counts.enter + counts.absent + ENTER_COUNTS),
     )
-
-
-def normalised(mass: Tensor) -> Tensor:
-    """Mass (..., S) that adds up to 1."""
-    return mass / mass.sum(-1, keepdim=True)
-
-
-def near_mass(mass: Tensor, radius: int) -> Tensor:
-    """The mass of each place and its neighbours up to a radius, (..., N) -> (..., N)."""
-    radius = min(radius, mass.shape[-1])
-    return window_sums(F.pad(mass, (radius, radius)), 2 * radius + 1).clamp(0, 1)
 
 
 def stretches(queries: int, correlation: float, places: int = 1, repeated: float = 1.0) -> Tensor:

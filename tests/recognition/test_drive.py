@@ -15,6 +15,7 @@ from dejavu_torch.evaluation.curves import evaluate
 from dejavu_torch.motion.resampling import ground_truth_of
 from dejavu_torch.places.layout import Layout
 from dejavu_torch.recognition import drive as driving
+from dejavu_torch.recognition import engine
 from dejavu_torch.recognition import smoother as smoothing
 from dejavu_torch.recognition.calibration import Platt, confidence_of
 from dejavu_torch.recognition.drive import DriveQuery, doubt, localize_drive, localize_drives
@@ -163,7 +164,7 @@ def test_drives_are_matched_together_as_each_by_itself():
 def test_scores_are_computed_once_if_they_can_be_kept(kept, monkeypatch):
     monkeypatch.setattr(driving, "SCORES_KEPT", kept)
     monkeypatch.setattr(smoothing, "NUMBERS_AT_ONCE", 2**12)
-    monkeypatch.setattr(smoothing, "HELD", 2**12)
+    monkeypatch.setattr(engine, "HELD", 2**12)
     scores, asked = shown(80, [*range(5, 75)]), torch.zeros(70)
 
     def rows(numbers):

@@ -13,10 +13,10 @@ from hypothesis import strategies as st
 from dejavu_torch import DejaVu, PlaceFilter, SequenceMatcher
 from dejavu_torch.maps.place_map import PlaceMap
 from dejavu_torch.recognition.calibration import Platt, Track
+from dejavu_torch.recognition.engine import sweep
 from dejavu_torch.recognition.filter import moments_of, near_scores
 from dejavu_torch.recognition.localizer import Localizer, Matching
 from dejavu_torch.recognition.online import Learned
-from dejavu_torch.recognition.smoother import sweep
 from dejavu_torch.types import Match, SequenceModel
 
 

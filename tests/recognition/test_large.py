@@ -16,9 +16,10 @@ from dejavu_torch.places.states import States
 from dejavu_torch.recognition import drive as driving
 from dejavu_torch.recognition import large
 from dejavu_torch.recognition.drive import DriveQuery, localize_drive
+from dejavu_torch.recognition.engine import Rates
 from dejavu_torch.recognition.large import LargeDrive, is_large
 from dejavu_torch.recognition.localizer import Matching, answer
-from dejavu_torch.recognition.motion import Motion, Rates
+from dejavu_torch.recognition.motion import AlongRoute
 from dejavu_torch.recognition.scorer import OfMap, OfRows
 from dejavu_torch.recognition.smoother import PlaceSmoother
 
@@ -170,7 +171,7 @@ def test_routes_and_circuits_end_where_they_say(monkeypatch):
     assert some.links == ((6, 4, 1.0), (2, 0, 0.5))
     assert some.share == 0.7
     rates = Rates(torch.tensor([0.0, 1.0]), *torch.tensor([0.1, 0.0, 0.2]).unbind())
-    motion = Motion(some, rates)
+    motion = AlongRoute(some, rates)
     belief = torch.eye(15)[4]
     moved = motion.moved(belief)
     assert float(moved.sum()) == pytest.approx(1)

@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 from reference import Steps
 
 from dejavu_torch.places.states import States
-from dejavu_torch.recognition.motion import Motion, Rates, checked_rates
+from dejavu_torch.recognition.engine import Rates
+from dejavu_torch.recognition.motion import AlongRoute, checked_rates
 
 
 @st.composite
@@ -38,7 +39,7 @@ def steps_of(draw):
 def motion_of(steps):
     rates = (torch.tensor(one, dtype=torch.float64) for one in steps[1:5])
     states = States(steps.places, steps.directions, tuple(steps.starts), tuple(steps.links), steps.turn)
-    return Motion(states, Rates(*rates))
+    return AlongRoute(states, Rates(*rates))
 
 
 def matrix_of(steps):
@@ -109,7 +110,7 @@ def test_single_precision_loses_nobody_off_the_end_of_a_road():
     """With nobody leaving, rounding makes no mass negative, whose logarithm would be NaN."""
     moves = torch.tensor([0.2, 0.5, 0.2, 0.05, 0.02, 0.015, 0.015])
     none = torch.tensor(0.0)
-    motion = Motion(States(1000, 2), Rates(moves, none, none, none))
+    motion = AlongRoute(States(1000, 2), Rates(moves, none, none, none))
     assert (motion.lost[:, :-6] == 0).all()
     belief = torch.zeros(2001)
     belief[3:900] = 1 / 897

@@ -13,8 +13,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from reference import Steps, all_paths, forward_backward
 
-from dejavu_torch.recognition.motion import Motion
-from dejavu_torch.recognition.smoother import PlaceSmoother, normalised, stretches, sweep, updated_rates
+from dejavu_torch.recognition.engine import folded, normalised, sweep
+from dejavu_torch.recognition.motion import AlongRoute
+from dejavu_torch.recognition.smoother import PlaceSmoother, stretches, updated_rates
 
 MOVES = (0.2, 0.5, 0.2, 0.1)
 
@@ -73,7 +74,7 @@ def test_equals_a_literal_loop_in_blocks_of_any_size(smoother, shape, size, two_
     found = smoother.posterior(scores, route_starts=starts)
     blocks = list(smoother.blocks(smoother.drive(scores), starts, size))
     assert smoother.log_evidence(scores, route_starts=starts).item() == pytest.approx(total, abs=1e-9)
-    assert torch.allclose(found, smoother.folded(states), atol=1e-9)
+    assert torch.allclose(found, folded(states, scores.shape[1]), atol=1e-9)
     assert torch.allclose(found.sum(1), torch.ones(queries, dtype=torch.float64))
     assert [block.first for block in blocks] == [*range(0, queries, size)][::-1]
     assert torch.allclose(torch.cat([block.posterior for block in blocks[::-1]]), states, atol=1e-9)
@@ -94,7 +95,7 @@ def test_a_stop_moves_nowhere_and_counts_once():
     steps = steps_of(smoother, 2)
     expected, total = forward_backward(steps, log.tolist(), still.tolist())
     states = torch.tensor(expected, dtype=torch.float64)
-    assert torch.allclose(smoother.posterior(scores), smoother.folded(states))
+    assert torch.allclose(smoother.posterior(scores), folded(states, scores.shape[1]))
     assert smoother.log_evidence(scores).item() == pytest.approx(total)
     assert torch.equal(smoother.path(scores)[1:23], smoother.path(scores)[1].expand(22))
 
@@ -160,12 +161,12 @@ def test_climbing_the_likelihood_finds_the_moves_that_counting_finds():
     """With the same evidence, and the prior of five more steps of each kind of move."""
     scores = shown(15, [*range(0, 15, 2), *range(14, 0, -3), *range(8)], clear=3.0).double()
     smoother, prior = PlaceSmoother(MOVES, 0.02, 0.02, 0.05).double(), torch.full((4,), 5.0).double()
-    drive, first = smoother.drive(scores), smoother.motion(15, (0,), scores)
-    like = smoother.wide(drive.log_likelihood(torch.arange(len(scores))), 0.0).exp()
+    drive, first = smoother.drive(scores), smoother.steps(15, (0,), scores)
+    like = first.wide(drive.log_likelihood(torch.arange(len(scores))), 0.0).exp()
     with torch.no_grad():
         rates = first.rates
         for _ in range(100):
-            motion = Motion(first.states, rates)
+            motion = AlongRoute(first.states, rates)
             (block,) = sweep(motion, lambda *_: like, len(like), drive.spacing.still, len(like))
             belief, after = normalised(block.before * block.likelihood), block.likelihood * block.after
             rates = updated_rates(motion.counts(belief[:-1], after[1:]), prior)
@@ -266,7 +267,7 @@ def test_queries_that_say_nothing_are_as_without_them():
     log[20:25] = 0
     expected, _ = forward_backward(steps_of(smoother, 60), log.tolist(), [False] * 60)
     for one in found:
-        assert torch.allclose(one, smoother.folded(torch.tensor(expected)), atol=1e-4)
+        assert torch.allclose(one, folded(torch.tensor(expected), 60), atol=1e-4)
     assert found[0][20:25, :-1].argmax(1).tolist() == [*range(20, 25)]
 
 
@@ -340,7 +341,9 @@ def test_scores_may_be_made_as_they_are_asked_for():
     assert repr(made) == repr(given_)
     assert asked[1:] == [*range(50)]  # after a look at how many places there are
     blocks = made.blocks(made.drive(rows, descriptors), size=7)
-    found = torch.cat([made.folded(block.posterior) for block in blocks][::-1])
+    found = torch.cat(
+        [folded(block.posterior, (block.posterior.shape[1] - 1) // 2) for block in blocks][::-1]
+    )
     assert torch.allclose(found, given_.posterior(scores, descriptors), atol=1e-6)
     assert made.log_likelihood == given_.log_likelihood
     again = repr(made.fit(rows, descriptors))

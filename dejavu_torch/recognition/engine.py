@@ -1,0 +1,373 @@
+"""One hidden Markov engine: where a camera is, by its motion and by what each query says of every state.
+
+States are numbered by a motion, (..., S), being off the map last; leading dimensions are drives of their own.
+Filter, smoother and flights use it: parameters go in, beliefs and what was learned come out.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Sequence
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from dejavu_torch.places.rectangles import window_sums
+from dejavu_torch.places.states import States
+from dejavu_torch.recognition.evidence import RankTable, Standardised
+
+MIN_PROBABILITY = 1e-30  # a probability of 0, with a finite gradient
+ROUNDS = 5  # of expectation-maximisation
+RADIUS = 5  # places around a right one whose scores are not counted as wrong
+NUMBERS_AT_ONCE = 2**20  # numbers of a block of queries and states, which stays in the cache
+HELD = 2**25  # of all of them, up to which they are kept for the way back
+
+Likelihood = Callable[[int, int], Tensor]  # of the queries [first, last), (..., B, S)
+
+
+class Rates(NamedTuple):
+    """Probabilities of a step, as tensors: moves (..., M) add up to 1; jump, leave and enter (...)."""
+
+    moves: Tensor
+    jump: Tensor
+    leave: Tensor
+    enter: Tensor
+
+
+class Counts(NamedTuple):
+    """Expected numbers of steps: moves (M,); jump, leave, enter, and staying off the map, each ()."""
+
+    moves: Tensor
+    jump: Tensor
+    leave: Tensor
+    enter: Tensor
+    absent: Tensor
+
+
+class Motion(ABC):
+    """A step of a camera from one query to the next, and its transpose; rates of several drives (C,) go with
+    beliefs (C,S).
+
+    One's own needs `moved` and `expected`; its states are the places in order, and being off the map, and it
+    learns no rates. `directions` are those of the `States` that a smoother makes it of.
+    """
+
+    directions = 1
+
+    def __init__(self, states: States, rates: Rates) -> None:
+        self.states, self.rates = states, rates
+        self.each = states.share / max(1, states.directions * states.places)
+
+    @abstractmethod
+    def moved(self, belief: Tensor) -> Tensor:
+        """The belief before the next query."""
+
+    @abstractmethod
+    def expected(self, message: Tensor) -> Tensor:
+        """What a message of the next query says of the state before: the transpose of `moved`."""
+
+    def anywhere(self) -> Tensor:
+        """The belief before the first query: on or off the map in the equilibrium of leaving and entering."""
+        both = (self.rates.leave + self.rates.enter).clamp(min=MIN_PROBABILITY)
+        off = (self.rates.leave / both).clamp(max=0.5)
+        on = 1 - off[..., None]
+        places = self.states.directions * self.states.places
+        return torch.cat([(on * self.each).expand(*off.shape, places), 1 - on * self.states.share], -1)
+
+    def counts(self, before: Tensor, after: Tensor) -> Counts:
+        """Expected numbers of steps (the E-step of Baum and Welch).
+
+        Args:
+            before: (..., S) beliefs given all queries so far. after: (..., S) messages of the next query and
+                all after it, of any scale.
+        """
+        moves = torch.zeros_like(self.rates.moves)
+        return Counts(moves, *moves.new_zeros(4))
+
+    def wide(self, places: Tensor, off: float) -> Tensor:
+        """Numbers of the places (..., N) for all states (..., S)."""
+        ways = [places, places.flip(-1)][: self.states.directions]
+        return torch.cat([*ways, places.new_full((*places.shape[:-1], 1), off)], -1)
+
+    def folded(self, mass: Tensor) -> Tensor:
+        """Mass of all states (..., S) -> of the places, whichever way, and off the map, (..., N+1)."""
+        return folded(mass, self.states.places)
+
+    def masses(self, block: Block) -> tuple[Tensor, Tensor]:
+        """Of each query, the mass of the places, and without its own evidence: (..., B, N) each."""
+        each = block.posterior, normalised(block.before * block.after)
+        own, others = (self.folded(one)[..., :-1] for one in each)
+        return own, others
+
+    def near(self, mass: Tensor, radius: int) -> Tensor:
+        """The mass of each place and its neighbours up to a radius, (..., N) -> (..., N)."""
+        return near_mass(mass, radius)
+
+    def ahead(self, belief: Tensor, likelihood: Tensor, still: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Forward over some queries.
+
+        Args:
+            belief: (..., S) before any move to the first. likelihood: (..., B, S). still: (..., B) bool, the
+                queries to which nothing moves.
+
+        Returns:
+            Beliefs before each query (..., B, S), log likelihoods (..., B), and the last belief.
+        """
+        before, totals = [], []
+        for t, seen in enumerate(likelihood.unbind(-2)):
+            belief = self._unless(still[..., t], self.moved, belief)
+            before.append(belief.expand_as(seen))
+            joint = belief * seen
+            total = joint.sum(-1, keepdim=True)
+            belief = joint / total
+            totals.append(total)
+        return torch.stack(before, -2), torch.cat(totals, -1).log(), belief
+
+    def behind(self, message: Tensor, likelihood: Tensor, still: Tensor) -> tuple[Tensor, Tensor]:
+        """Backward over some queries: messages (..., S) of those after the last one -> (..., B, S) of those
+        after each, and that of the first and all after it."""
+        after = []
+        for t in reversed(range(likelihood.shape[-2])):
+            after.append(message)
+            message = message * likelihood[..., t, :]
+            message = message / message.amax(-1, keepdim=True)
+            message = self._unless(still[..., t], self.expected, message)
+        return torch.stack(after[::-1], -2), message
+
+    @staticmethod
+    def _unless(still: Tensor, step: Callable[[Tensor], Tensor], belief: Tensor) -> Tensor:
+        if not still.any():
+            return step(belief)
+        return belief if still.all() else torch.where(still[..., None], belief, step(belief))
+
+
+class Block(NamedTuple):
+    """Consecutive queries from `first` on, of a sweep: (..., B, S) each, as `States` numbers them.
+
+    before: beliefs given the queries before each. likelihood: of each query, 1 off the map. after: messages
+    of the queries after each, of any scale. log: (..., B), likelihood of each query given those before.
+    """
+
+    first: int
+    before: Tensor
+    likelihood: Tensor
+    after: Tensor
+    log: Tensor
+
+    @property
+    def posterior(self) -> Tensor:
+        return normalised(self.before * self.likelihood * self.after)
+
+
+class Ahead(NamedTuple):
+    """As `Block`, of a pass forward alone; start: (..., S), the belief before any move to its first query."""
+
+    first: int
+    start: Tensor
+    before: Tensor
+    likelihood: Tensor
+    log: Tensor
+
+
+def forward(
+    motion: Motion,
+    likelihood: Likelihood,
+    numbers: range,
+    still: Tensor,
+    start: Tensor | None = None,
+) -> Iterator[Ahead]:
+    """Forward over the queries, in blocks.
+
+    Args:
+        likelihood: of the queries [first, last), (..., B, S). numbers: the first queries of all blocks.
+        still: (..., Q) bool, where nothing moves. start: the belief to begin with.
+    """
+    belief = motion.anywhere() if start is None else start
+    for first in numbers:
+        last = min(first + numbers.step, numbers.stop)
+        start, like = belief, likelihood(first, last)
+        before, log, belief = motion.ahead(belief, like, at_rest(still, first, last))
+        yield Ahead(first, start, before, like, log)
+
+
+def sweep(motion: Motion, likelihood: Likelihood, queries: int, still: Tensor, size: int) -> Iterator[Block]:
+    """Forward and backward over the queries, in blocks of `size`, which come from the last to the first;
+    see `forward`."""
+    numbers, parts = range(0, queries, size), []
+    for part in forward(motion, likelihood, numbers, still):
+        held = part.first == numbers[-1] or part.before[..., 0, :].numel() * queries <= HELD
+        parts.append((part.first, part.start, part if held else None))
+    message: Tensor | None = None  # of the queries after a block, before any move from its last
+    while parts:
+        first, start, known = parts.pop()
+        part = known or next(forward(motion, likelihood, numbers[first // size :], still, start))
+        if message is None:
+            message = torch.ones_like(part.likelihood[..., -1, :])
+        rests = at_rest(still, first, first + part.likelihood.shape[-2])
+        after, message = motion.behind(message, part.likelihood, rests)
+        yield Block(part.first, part.before, part.likelihood, after, part.log)
+
+
+def at_rest(still: Tensor, first: int, last: int) -> Tensor:
+    """Which of the queries [first, last) the camera does not move to; the first of all is none."""
+    rests = still[..., first:last]
+    return rests if first else torch.cat([torch.ones_like(rests[..., :1]), rests[..., 1:]], -1)
+
+
+class FittedPart(NamedTuple):
+    """Stretches of a drive that are learned from: (..., L, N) at some places; weight and still (..., L) as in
+    `Spacing`. over: makes the motion over these places."""
+
+    std: Standardised
+    weight: Tensor
+    still: Tensor
+    over: Callable[[Rates], Motion]
+
+    def part(self, first: int, last: int) -> FittedPart:
+        """The queries [first, last) of each stretch."""
+        std = self.std.map(lambda column: column.narrow(self.weight.ndim - 1, first, last - first))
+        return FittedPart(std, self.weight[..., first:last], self.still[..., first:last], self.over)
+
+
+class Fit(NamedTuple):
+    """What expectation-maximisation found.
+
+    log: nats by which the model beats being off the map. held: likewise, with jumps, and ways off the
+    map, as rare as by the prior.
+    """
+
+    rates: Rates
+    separation: float
+    values: Tensor  # of the rank table
+    log: float
+    held: float
+
+
+class Evidence(NamedTuple):
+    """What the scores of a part say of each place: by the `values` of a rank table, `separation` apart, as if
+    `tempering` queries were one."""
+
+    values: Tensor
+    separation: float
+    tempering: float
+
+    def __call__(self, std: Standardised, weight: Tensor) -> Tensor:
+        """Tempered log likelihood ratio of scores (..., Q, N), right ones beside wrong ones: their normal
+        scores are Gaussian with variance 1."""
+        return self.of_normal(RankTable.look_up(self.values, std.z), std, weight)
+
+    def of_normal(self, normal: Tensor, std: Standardised, weight: Tensor) -> Tensor:
+        """The same, by normal scores (..., Q, N)."""
+        shares = self.separation / self.tempering * (weight * std.speaks)[..., None]
+        return std.only((normal - self.separation / 2) * shares, -math.inf)
+
+    def likelihood(self, sample: FittedPart, motion: Motion, normal: Tensor | None = None) -> Likelihood:
+        """That of a sample, 1 off the map, by its normal scores, if they are known."""
+
+        def likelihood(first: int, last: int) -> Tensor:
+            std, weight, *_ = sample.part(first, last)
+            if normal is None:
+                return motion.wide(self(std, weight).exp(), 1.0)
+            own = normal.narrow(-2, first, last - first)
+            return motion.wide(self.of_normal(own, std, weight).exp(), 1.0)
+
+        return likelihood
+
+
+def explained(
+    sample: FittedPart,
+    evidence: Evidence,
+    motion: Motion,
+    size: int | None = None,
+    normal: Tensor | None = None,
+) -> Iterator[Block]:
+    """What follows from a sample, in blocks of `size` queries, the last first."""
+    queries, size = sample.weight.shape[-1], size or size_of(sample, motion)
+    yield from sweep(motion, evidence.likelihood(sample, motion, normal), queries, sample.still, size)
+
+
+def size_of(sample: FittedPart, motion: Motion) -> int:
+    """Queries of a block."""
+    *lead, _ = sample.weight.shape
+    return max(1, NUMBERS_AT_ONCE // (math.prod(lead) * motion.anywhere().shape[-1]))
+
+
+@torch.no_grad()
+def learn(
+    samples: Sequence[FittedPart],
+    ranks: RankTable,
+    rates: Rates,
+    evidence: tuple[float, float, float],
+    again: Callable[[Counts], Rates],
+) -> tuple[Rates, float, Tensor]:
+    """Expectation-maximisation of rates, separation and ranks.
+
+    Args:
+        samples: of one drive. ranks: of all their scores. rates: to begin with. evidence: the separation to
+            begin with, the least one, and the tempering. again: rates by counts, with those of the priors.
+
+    Returns:
+        Rates, separation, and the `values` of the table of wrong scores.
+    """
+    separation, least, tempering = evidence
+    table, z = ranks, samples[0].std.z
+    for _ in range(ROUNDS):
+        values, table, sums, counts = table.values, RankTable(ranks.counts), z.new_zeros(2), []
+        for sample in samples:
+            motion, later = sample.over(rates), None
+            normal = RankTable.look_up(values, sample.std.z)
+            for block in explained(sample, Evidence(values, separation, tempering), motion, None, normal):
+                first, last = block.first, block.first + block.log.shape[-1]
+                std, weight, *_ = sample.part(first, last)
+                shares = (weight * std.speaks)[..., None]
+                own, others = motion.masses(block)
+                table.add(std.z, std.only(-shares * motion.near(own, RADIUS), 0))  # right ones
+                # without its own evidence, that of a query is not mistaken for that of its place
+                others = others * shares
+                known = std.only(normal.narrow(-2, first, last - first), 0)
+                sums += torch.stack([(others * known).sum(), others.sum()])
+                belief, after = block.before * block.likelihood, block.likelihood * block.after
+                later = after[..., 1:, :] if later is None else torch.cat([after[..., 1:, :], later], -2)
+                pair = belief[..., : later.shape[-2], :], later
+                still = sample.still[..., first + 1 : last + 1]
+                if still.any():
+                    pair = pair[0][~still], pair[1][~still]
+                counts.append(motion.counts(*pair))
+                later = after[..., :1, :]
+        separation = max(least, float(sums[0] / sums[1].clamp(min=MIN_PROBABILITY)))
+        rates = again(Counts(*(torch.stack(kind).sum(0) for kind in zip(*counts, strict=True))))
+    return rates, separation, table.values
+
+
+@torch.no_grad()
+def nats(samples: Sequence[FittedPart], evidence: Evidence, rates: Rates) -> float:
+    """By how much a model beats being off the map."""
+    total = 0.0
+    for sample in samples:
+        motion = sample.over(rates)
+        numbers = range(0, sample.weight.shape[-1], size_of(sample, motion))
+        parts = forward(motion, evidence.likelihood(sample, motion), numbers, sample.still)
+        total += float(sum(part.log.sum() for part in parts))
+    return total
+
+
+def normalised(mass: Tensor) -> Tensor:
+    """Mass (..., S) that adds up to 1."""
+    return mass / mass.sum(-1, keepdim=True)
+
+
+def folded(mass: Tensor, places: int) -> Tensor:
+    """Mass of the places in one or two directions, and off the map, (..., S) -> of the places whichever way,
+    and off the map, (..., N+1)."""
+    if mass.shape[-1] == places + 1:
+        return mass
+    return torch.cat([mass[..., :places] + mass[..., places:-1].flip(-1), mass[..., -1:]], -1)
+
+
+def near_mass(mass: Tensor, radius: int) -> Tensor:
+    """The mass of each place and its neighbours up to a radius, (..., N) -> (..., N)."""
+    radius = min(radius, mass.shape[-1])
+    return window_sums(F.pad(mass, (radius, radius)), 2 * radius + 1).clamp(0, 1)

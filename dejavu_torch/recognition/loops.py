@@ -1,0 +1,254 @@
+"""A step along routes as loops, in single precision; compiled by numba, where it is installed.
+
+Beliefs are (S,): the places in one or two directions (D,N), then being off the map; see `AlongRoute`.
+"""
+
+from __future__ import annotations
+
+from functools import cache, partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dejavu_torch.maps.compiling import Floats, Kernel, compiled
+
+Numbers = NDArray[np.int64]
+
+# A route is `keep` (D,N), links as direction, from and to (L,3), with their shares (L,), the probability of a
+# turn, and whether it is plain, without ends or links; a motion, moves (C,V+1), the shares of a state's mass
+# that go anywhere, and off the map, (C,S) each, and the mass of each place of what goes anywhere.
+ROUTE = "Tuple((float32[:,::1], int64[:,::1], float32[::1], float32, boolean))"
+MOTION = "Tuple((float32[:,::1], float32[:,::1], float32[:,::1], float32))"
+SEEN = "float32[:,::1], float32[:,:,::1], boolean[:,::1]"
+SWEPT = f"void({SEEN}, {MOTION}, {ROUTE}, float32[:,:,::1], float32[:,::1])"
+Route = tuple[Floats, Numbers, Floats, float, bool]
+Steps = tuple[Floats, Floats, Floats, float]
+
+
+# All loops count from 0 over slices, which the compiler makes vectors of.
+
+
+def _turned(on: Floats, turn: float, out: Floats) -> None:
+    """Mass (D N), some of it in the other direction."""
+    back = on[::-1]
+    for i in range(len(on)):
+        out[i] = on[i] + turn * (back[i] - on[i])
+
+
+def _added(factor: float, on: Floats, out: Floats) -> None:
+    for i in range(len(on)):
+        out[i] += factor * on[i]
+
+
+def _scaled(factor: float, on: Floats, out: Floats) -> None:
+    for i in range(len(on)):
+        out[i] = factor * on[i]
+
+
+def _product(one: Floats, other: Floats) -> np.float32:
+    total = np.float32(0)
+    for i in range(len(one)):
+        total += one[i] * other[i]
+    return total  # type: ignore[no-any-return]
+
+
+def _times(one: Floats, other: Floats, out: Floats) -> None:
+    for i in range(len(one)):
+        out[i] = one[i] * other[i]
+
+
+def _shifted(on: Floats, route: Route, back: bool, out: Floats) -> None:
+    """Mass (D N) one place further, or its transpose."""
+    keep, linked, shares, _, _ = route
+    n = keep.shape[1]
+    for d in range(keep.shape[0]):
+        own, moved, kept = on[d * n : d * n + n], out[d * n : d * n + n], keep[d, 1:]
+        if back:
+            moved[n - 1] = 0
+            _times(kept, own[1:], moved)
+        else:
+            moved[0] = 0
+            _times(kept, own, moved[1:])
+    for k in range(len(shares)):
+        first = linked[k, 0] * n
+        at, to = first + linked[k, 1], first + linked[k, 2]
+        if back:
+            out[at] += shares[k] * on[to]
+        else:
+            out[to] += shares[k] * on[at]
+
+
+def _by_all_moves(on: Floats, moves: Floats, route: Route, back: bool, scratch: Floats, out: Floats) -> None:
+    """The sum of mass (D N) moved by 0 to V places, each times its probability."""
+    keep, _, _, _, plain = route
+    n = keep.shape[1]
+    _scaled(moves[0], on, out)
+    if plain:
+        for d in range(keep.shape[0]):
+            own, moved = on[d * n : d * n + n], out[d * n : d * n + n]
+            for v in range(1, min(len(moves), n)):
+                if back:
+                    _added(moves[v], own[v:], moved)
+                else:
+                    _added(moves[v], own[: n - v], moved[v:])
+        return
+    one, other = scratch[0], scratch[1]
+    one[:] = on
+    for v in range(1, len(moves)):
+        _shifted(one, route, back, other)
+        one, other = other, one
+        _added(moves[v], one, out)
+
+
+def _ahead(
+    belief: Floats,
+    likelihood: Floats,
+    still: NDArray[np.bool_],
+    motion: Steps,
+    route: Route,
+    before: Floats,
+    totals: Floats,
+) -> None:
+    """`Motion.ahead`, of drives (C,B,S); the belief (C,S) becomes the last one."""
+    (moves, free, gone, each), (keep, _, _, turn, _) = motion, route
+    drives, queries, states = likelihood.shape
+    n = states - 1
+    start, scratch = np.empty(n, np.float32), np.empty((2, n), np.float32)
+    for c in range(drives):
+        own = belief[c]
+        for t in range(queries):
+            out = before[c, t]
+            if still[c, t]:
+                out[:] = own
+            else:
+                anywhere = np.float32(each) * _product(own, free[c])
+                if keep.shape[0] > 1:
+                    _turned(own[:n], turn, start)
+                else:
+                    start[:] = own[:n]
+                _by_all_moves(start, moves[c], route, False, scratch, out[:n])
+                for i in range(n):
+                    out[i] += anywhere
+                out[n] = _product(own, gone[c])
+            _times(out, likelihood[c, t], own)
+            total = np.float32(0)
+            for i in range(states):
+                total += own[i]
+            totals[c, t] = total
+            _scaled(1 / total, own, own)
+
+
+def _behind(
+    message: Floats,
+    likelihood: Floats,
+    still: NDArray[np.bool_],
+    motion: Steps,
+    route: Route,
+    after: Floats,
+    totals: Floats,
+) -> None:
+    """`Motion.behind`, of drives (C,B,S); the message (C,S) becomes that of the first query."""
+    (moves, free, gone, each), (keep, _, _, turn, _) = motion, route
+    drives, queries, states = likelihood.shape
+    n = states - 1
+    back, scratch = np.empty(n, np.float32), np.empty((2, n), np.float32)
+    for c in range(drives):
+        own = message[c]
+        for t in range(queries - 1, -1, -1):
+            after[c, t, :] = own
+            _times(own, likelihood[c, t], own)
+            total = np.float32(0)
+            for i in range(states):
+                total += own[i]
+            _scaled(1 / total, own, own)
+            if still[c, t]:
+                continue
+            off = own[n]
+            total = np.float32(1) - off
+            _by_all_moves(own[:n], moves[c], route, True, scratch, back)
+            if keep.shape[0] > 1:
+                _turned(back, turn, own[:n])
+            else:
+                own[:n] = back
+            own[n] = 0
+            _added(np.float32(each) * total, free[c], own)
+            _added(off, gone[c], own)
+
+
+def _counted(
+    before: Floats,
+    after: Floats,
+    lost: Floats,
+    route: Route,
+    out: Floats,
+) -> None:
+    """Of beliefs and messages (B,S), the weight of each move, (B,V+1), without its probability; a share of
+    `lost` (V+1,S-1) leaves the map."""
+    keep, _, _, turn, plain = route
+    n, width = before.shape[1] - 1, keep.shape[1]
+    start, scratch = np.empty(n, np.float32), np.empty((2, n), np.float32)
+    for t in range(len(before)):
+        if keep.shape[0] > 1:
+            _turned(before[t, :n], turn, start)
+        else:
+            start[:] = before[t, :n]
+        one, other, off = scratch[0], scratch[1], after[t, n]
+        one[:] = after[t, :n]
+        for v in range(out.shape[1]):
+            total = off * _product(start, lost[v])
+            if not plain:
+                total += _product(start, one)
+                _shifted(one, route, True, other)
+                one, other = other, one
+            elif v < width:
+                for d in range(keep.shape[0]):
+                    own, later = start[d * width : d * width + width], one[d * width : d * width + width]
+                    total += _product(own[: width - v], later[v:])
+            out[t, v] = total
+
+
+def _masses(before: Floats, likelihood: Floats, after: Floats, own: Floats, others: Floats) -> None:
+    """`Motion.masses`, of rows (B,S) in one or two directions."""
+    n = own.shape[1]
+    two = before.shape[1] > n + 1
+    every, plain = np.empty(before.shape[1], np.float32), np.empty(before.shape[1], np.float32)
+    for t in range(len(before)):
+        _times(before[t], after[t], plain)
+        _times(plain, likelihood[t], every)
+        for part, out in ((every, own[t]), (plain, others[t])):
+            total = np.float32(0)
+            for i in range(len(part)):
+                total += part[i]
+            _scaled(1 / total, part[:n], out)
+            if two:
+                _added(1 / total, part[2 * n - 1 : n - 1 : -1], out)
+
+
+FAST = {"reassoc", "nsz", "contract"}  # not "nnan" and "ninf", which lose NaN and infinity
+CALLS = _turned, _added, _scaled, _product, _times, _shifted, _by_all_moves
+compiled_by = partial(compiled, what="drives by torch", calls=CALLS, fastmath=FAST)
+
+
+@cache
+def ahead() -> Kernel | None:
+    """`_ahead` compiled."""
+    return compiled_by(_ahead, SWEPT)
+
+
+@cache
+def behind() -> Kernel | None:
+    """`_behind` compiled."""
+    return compiled_by(_behind, SWEPT)
+
+
+@cache
+def counted() -> Kernel | None:
+    """`_counted` compiled."""
+    given = ", ".join(["float32[:,::1]"] * 3)
+    return compiled_by(_counted, f"void({given}, {ROUTE}, float32[:,::1])")
+
+
+@cache
+def masses() -> Kernel | None:
+    """`_masses` compiled."""
+    return compiled_by(_masses, f"void({', '.join(['float32[:,::1]'] * 5)})")

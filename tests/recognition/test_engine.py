@@ -1,0 +1,93 @@
+"""The engine, held against an engine that is not ours, and its loops against torch."""
+
+from __future__ import annotations
+
+import importlib.util
+
+import pytest
+import torch
+from hmmlearn.base import BaseHMM
+from hypothesis import given
+from hypothesis import strategies as st
+from test_motion import matrix_of, motion_of, steps_of
+
+from dejavu_torch.places.states import States
+from dejavu_torch.recognition import motion as motions
+from dejavu_torch.recognition.engine import Block, Motion, Rates, normalised, sweep
+from dejavu_torch.recognition.motion import AlongRoute
+
+NUMBA = importlib.util.find_spec("numba") is not None
+
+
+class Given(BaseHMM):
+    """Of which the log likelihoods of the states are the observations."""
+
+    def _check(self):
+        pass
+
+    def _compute_log_likelihood(self, seen):
+        return seen
+
+
+@given(steps_of(), st.integers(1, 12), st.integers(1, 5), st.integers(0, 99))
+def test_a_sweep_is_that_of_hmmlearn(steps, queries, size, seed):
+    motion, matrix = motion_of(steps), matrix_of(steps)
+    draw = torch.Generator().manual_seed(seed)
+    log = 3 * torch.randn(queries, len(matrix), dtype=torch.float64, generator=draw)
+    other = Given(n_components=len(matrix))
+    other.startprob_, other.transmat_ = motion.anywhere().numpy(), matrix.numpy()
+    total, expected = other.score_samples(log.numpy())
+    still = torch.zeros(queries, dtype=torch.bool)
+    blocks = [*sweep(motion, lambda first, last: log[first:last].exp(), queries, still, size)][::-1]
+    found = torch.cat([block.posterior for block in blocks])
+    torch.testing.assert_close(found, torch.from_numpy(expected), atol=1e-9, rtol=1e-7)
+    assert float(sum(block.log.sum() for block in blocks)) == pytest.approx(total)
+
+
+def single(steps):
+    """The motion in single precision, and of two drives at once, of which the second moves more."""
+    moves, *rest = (torch.tensor(one, dtype=torch.float32) for one in steps[1:5])
+    other = torch.cat([moves[1:], moves[:1]])
+    rates = Rates(torch.stack([moves, other]), *(one.expand(2) for one in rest))
+    states = States(steps.places, steps.directions, tuple(steps.starts), tuple(steps.links), steps.turn)
+    return AlongRoute(states, Rates(moves, *rest)), AlongRoute(states, rates)
+
+
+@pytest.mark.skipif(not NUMBA, reason="numba is not installed")
+@given(steps_of(), st.integers(1, 6), st.integers(0, 99))
+def test_loops_do_as_torch_does(steps, queries, seed):
+    one, two = single(steps)
+    draw = torch.Generator().manual_seed(seed)
+    size = len(one.anywhere())
+    likelihood = torch.rand(2, queries, size, generator=draw) + 1e-3
+    still = torch.rand(2, queries, generator=draw) < 0.3
+    starts = torch.rand(2, size, generator=draw), torch.rand(2, size, generator=draw)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(motions, "WORTH_COMPILING", 1)
+        for motion, start in ((one, starts[0]), (one, starts[0][0]), (two, starts[0])):
+            expected = Motion.ahead(motion, start, likelihood, still)
+            for own, other in zip(motion.ahead(start, likelihood, still), expected, strict=True):
+                torch.testing.assert_close(own, other, atol=1e-5, rtol=1e-4)
+        after, message = one.behind(starts[1], likelihood, still)
+        literal, last = Motion.behind(one, starts[1], likelihood, still)
+        torch.testing.assert_close(normalised(after), normalised(literal), atol=1e-5, rtol=1e-4)
+        torch.testing.assert_close(normalised(message), normalised(last), atol=1e-5, rtol=1e-4)
+        block = Block(0, starts[0][:, None].expand_as(likelihood), likelihood, after, still.float())
+        pairs = block.before * likelihood, after
+        found, masses = one.counts(*pairs), one.masses(block)
+        patch.setattr(motions, "WORTH_COMPILING", 2**30)
+        for own, other in zip(found, one.counts(*pairs), strict=True):
+            torch.testing.assert_close(own, other, atol=1e-5, rtol=1e-4)
+        for own, other in zip(masses, Motion.masses(one, block), strict=True):
+            torch.testing.assert_close(own, other, atol=1e-5, rtol=1e-4)
+
+
+def test_gradients_go_through_torch(monkeypatch):
+    monkeypatch.setattr(motions, "WORTH_COMPILING", 1)
+    moves = torch.tensor([0.2, 0.8], requires_grad=True)
+    motion = AlongRoute(States(5, 2), Rates(moves, *torch.tensor([0.01, 0.01, 0.1])))
+    seen = torch.rand(4, 11, generator=torch.Generator().manual_seed(0))
+    still = torch.zeros(4, dtype=torch.bool)
+    (block,) = sweep(motion, lambda *_: seen, 4, still, 4)
+    block.log.sum().backward()
+    assert bool((moves.grad != 0).all())
