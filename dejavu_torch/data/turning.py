@@ -45,7 +45,7 @@ class Turned(Part):
 
 def is_turned(traverse: Traverse) -> bool:
     """Whether images are turned, and what they have in common has to be removed, see `set_apart`."""
-    return isinstance(traverse, Turned)
+    return hasattr(traverse, "heading")
 
 
 def facing_north(traverse: Traverse, layout: Layout, headings: int = 1) -> Traverse:

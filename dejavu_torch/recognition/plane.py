@@ -65,6 +65,8 @@ class PlaneMotion(Motion):
 
     def counts(self, before: Tensor, after: Tensor) -> Counts:
         (on, off), (later, absent) = self._split(before), self._split(after)
+        if not len(on):
+            return super().counts(before, after)
         _, jump, leave, enter = self.rates
         around = self._bordered(later, absent).transpose(0, 1)
         pairs = self.kernel[0] * F.conv2d(around, on[:, None], groups=len(on))[0]  # (B, 2 V + 1, 2 V + 1)
