@@ -194,7 +194,7 @@ MUTANTS = [
     ),
     Mutant(
         "Ahead of the first query a filter is off the map as likely as leaving and entering make it.",
-        "dejavu_torch/recognition/motion.py",
+        "dejavu_torch/recognition/engine.py",
         "off = (self.rates.leave / both).clamp(max=0.5)",
         "off = (self.rates.enter / both).clamp(max=0.5)",
         ("tests/recognition/test_filter.py::test_equals_a_literal_loop",),
@@ -593,8 +593,8 @@ MUTANTS = [
     Mutant(
         "Moves past the end of a route count as moves.",
         "dejavu_torch/recognition/motion.py",
-        " + off_after * lost",
-        "",
+        " + gone)",
+        ")",
         ("tests/recognition/test_motion.py::test_counts_are_those_of_each_pair_of_states",),
     ),
     Mutant(
@@ -634,16 +634,16 @@ MUTANTS = [
     ),
     Mutant(
         "Within a stop nothing moves, in either pass.",
-        "dejavu_torch/recognition/smoother.py",
-        "message = torch.where(still[..., t + 1, None], message, moved) if stops else moved",
-        "message = moved",
+        "dejavu_torch/recognition/engine.py",
+        "message = self._unless(still[..., t], self.expected, message)",
+        "message = self.expected(message)",
         ("tests/recognition/test_smoother.py::-k moves_nowhere",),
     ),
     Mutant(
         "The first query of a block follows the last one of the block before.",
-        "dejavu_torch/recognition/smoother.py",
-        "            if t:\n                moved = motion.moved(belief)",
-        "            if t > first:\n                moved = motion.moved(belief)",
+        "dejavu_torch/recognition/engine.py",
+        "return rests if first else torch.cat(",
+        "return torch.cat(",
         ("tests/recognition/test_smoother.py::-k blocks_of_any_size",),
     ),
     Mutant(
@@ -971,14 +971,14 @@ MUTANTS = [
     Mutant(
         "A smoother over an area moves as its kernel says, forward and backward.",
         "dejavu_torch/recognition/plane.py",
-        "self.kernel.flip(0, 1)",
+        "self.kernel.flip(2, 3)",
         "self.kernel",
         ("tests/test_area.py::-k masses_of_the_model",),
     ),
     Mutant(
         "A flight is a flight over an area only if it explains its images.",
         "dejavu_torch/recognition/flight.py",
-        "is_drive=moves_along(swept.log, nats_per_query)",
+        "is_drive=moves_along(log, nats_per_query)",
         "is_drive=True",
         ("tests/test_area.py::-k flight_is_found",),
     ),
@@ -1163,5 +1163,26 @@ MUTANTS = [
         "return Moved(drive, (usual,)) if usual else drive",
         "return drive",
         ("tests/test_views.py::-k placed_by",),
+    ),
+    Mutant(
+        "A compiled step turns round as torch's does.",
+        "dejavu_torch/recognition/loops.py",
+        "back = on[::-1]",
+        "back = on",
+        ("tests/recognition/test_engine.py::-k loops",),
+    ),
+    Mutant(
+        "A motion learns from steps that leave the end of a route.",
+        "dejavu_torch/recognition/loops.py",
+        "total = off * _product(start, lost[v])",
+        "total = np.float32(0)",
+        ("tests/recognition/test_engine.py::-k loops",),
+    ),
+    Mutant(
+        "A smoother moves as the motion that it was given.",
+        "dejavu_torch/recognition/smoother.py",
+        "motion = first.motion(",
+        "motion = AlongRoute(",
+        ("tests/recognition/test_engine.py::-k as_it_is_told",),
     ),
 ]

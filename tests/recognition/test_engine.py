@@ -6,6 +6,7 @@ import importlib.util
 
 import pytest
 import torch
+from helpers import refused
 from hmmlearn.base import BaseHMM
 from hypothesis import given
 from hypothesis import strategies as st
@@ -15,6 +16,7 @@ from dejavu_torch.places.states import States
 from dejavu_torch.recognition import motion as motions
 from dejavu_torch.recognition.engine import Block, Motion, Rates, normalised, sweep
 from dejavu_torch.recognition.motion import AlongRoute
+from dejavu_torch.recognition.smoother import PlaceSmoother
 
 NUMBA = importlib.util.find_spec("numba") is not None
 
@@ -80,6 +82,32 @@ def test_loops_do_as_torch_does(steps, queries, seed):
             torch.testing.assert_close(own, other, atol=1e-5, rtol=1e-4)
         for own, other in zip(masses, Motion.masses(one, block), strict=True):
             torch.testing.assert_close(own, other, atol=1e-5, rtol=1e-4)
+
+
+class Stairs(Motion):
+    """Stays, or goes two places on, round a ring; the camera never leaves it."""
+
+    def moved(self, belief):
+        on = belief[..., :-1]
+        return torch.cat([(on + on.roll(2, -1)) / 2, belief[..., -1:]], -1)
+
+    def expected(self, message):
+        on = message[..., :-1]
+        return torch.cat([(on + on.roll(-2, -1)) / 2, message[..., -1:]], -1)
+
+
+def test_a_smoother_moves_as_it_is_told():
+    scores = torch.rand(9, 7, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    smoother = PlaceSmoother(motion=Stairs).double()
+    motion, other = smoother.steps(7, (0,), scores), Given(n_components=8)
+    other.startprob_ = motion.anywhere().detach().numpy()
+    other.transmat_ = motion.moved(torch.eye(8, dtype=torch.float64)).numpy()
+    log = motion.wide(smoother.drive(scores).log_likelihood(torch.arange(9)), 0.0)
+    total, expected = other.score_samples(log.numpy())
+    torch.testing.assert_close(smoother.posterior(scores).detach(), torch.from_numpy(expected))
+    assert float(smoother.log_evidence(scores)) == pytest.approx(total)
+    with refused("the motion is a Stairs", "along a route"):
+        smoother.path(scores)
 
 
 def test_gradients_go_through_torch(monkeypatch):
