@@ -14,16 +14,22 @@ from torch import Tensor, nn
 
 from dejavu_torch.memory import check_room
 from dejavu_torch.places.layout import Layout
-from dejavu_torch.recognition.engine import Counts, Evidence, FittedPart, Rates, explained, learn
+from dejavu_torch.recognition.engine import Counts, Evidence, Fit, FittedPart, Rates, explained, learn, nats
 from dejavu_torch.recognition.evidence import RankTable, Spacing, place_means, standardised
 from dejavu_torch.recognition.motion import logits
 from dejavu_torch.recognition.plane import PlaneMotion, rings
-from dejavu_torch.recognition.smoother import MOVE_SHARE, PlaceSmoother, Rows, tempering_of
+from dejavu_torch.recognition.smoother import (
+    MOVE_SHARE,
+    PlaceSmoother,
+    Rows,
+    first_that_explains,
+    tempering_of,
+)
 from dejavu_torch.recognition.taken import moves_along
 
 # of which the fit starts: among so many windows a right one has to stand out more than along a route
-SEPARATION, SPREAD = 3.0, 2.0  # standard deviations of scores; windows that a step goes in each direction
-LEAST_SEPARATION = 1.0
+SEPARATION, LEAST_SEPARATION = 3.0, 1.0  # standard deviations of scores
+SPREADS = 2.0, 0.7, 4.0  # windows that a step goes in each direction, and where that explains little
 FITTED = 300  # queries in a row, from the middle, that a smoother is fitted to
 BYTES = 70  # of memory for each query and window
 
@@ -53,19 +59,24 @@ def place_flight(
     reach, first = len(smoother.move_logits) - 1, max(0, (queries - FITTED) // 2)
     part = slice(first, first + FITTED)
     some, own = std.map(lambda column: column[part]), weight[part]
-    away = torch.arange(-reach, reach + 1).square()
-    prior = torch.exp(-(away[:, None] + away) / (2 * SPREAD**2))
-    kernel, prior = (prior / prior.sum()).flatten(), MOVE_SHARE * len(own) * (prior / prior.sum()).flatten()
-    rates = Rates(kernel, *smoother.rates(own)[1:])
+    away, over = torch.arange(-reach, reach + 1).square(), partial(PlaneMotion, layout)
+    sample, _, *rare = FittedPart(some, own, spacing.still[part], over), *smoother.rates(own)
 
-    def again(counts: Counts) -> Rates:
-        moves = counts.moves + prior
-        return rates._replace(moves=moves / moves.sum())
+    def fitted(spread: float) -> Fit:
+        kernel = torch.exp(-(away[:, None] + away) / (2 * spread**2)).flatten()
+        prior = MOVE_SHARE * len(own) * kernel / kernel.sum()
 
-    over = partial(PlaneMotion, layout)
-    sample = FittedPart(some, own, spacing.still[part], over)
-    evidence = SEPARATION, LEAST_SEPARATION, tempering
-    rates, separation, values = learn([sample], ranks, rates, evidence, again)
+        def again(counts: Counts) -> Rates:
+            moves = counts.moves + prior
+            return Rates(moves / moves.sum(), *rare)  # jumps are not learned
+
+        given = SEPARATION, LEAST_SEPARATION, tempering
+        rates, separation, values = learn([sample], ranks, Rates(kernel / kernel.sum(), *rare), given, again)
+        log = nats([sample], Evidence(values, separation, tempering), rates)
+        return Fit(rates, separation, values, log, log)
+
+    moving = float((~sample.still).sum())
+    rates, separation, values, *_ = first_that_explains(map(fitted, SPREADS), moving, float(own.sum()))
     every, motion = FittedPart(std, weight, spacing.still, over), over(rates)
     mass, log = scores.new_empty(queries, layout.places), 0.0
     for block in explained(every, Evidence(values, separation, tempering), motion):
@@ -78,6 +89,6 @@ def place_flight(
         separation=separation,
         log_likelihood=log,
         nats_per_query=nats_per_query,
-        is_drive=moves_along(log, nats_per_query),  # jumps are not learned
+        is_drive=moves_along(log, nats_per_query),
         move_logits=nn.Parameter(logits(*moves.tolist()).to(smoother.move_logits)),
     )

@@ -331,12 +331,9 @@ class PlaceSmoother(SequenceModel):
         like = self.forgetful().changed(correlation=spacing.correlation, tempering=tempering_of(spacing))
         moving = float(sum((~sample.still).sum() for sample in samples))
         different = float(sum(sample.weight.sum() for sample in samples))
-        best = like._fitted(samples, ranks, self.prior, moving)
-        if best.log < max(OTHER_SPEED, PER_QUERY * moving) and self.prior == MOVES:
-            others = (like._fitted(samples, ranks, start, moving) for start in (SLOW, FAST))
-            other = max(others, key=lambda one: one.log)
-            least = max(OTHER_SPEED, PER_QUERY * different, CLEARLY * best.log)
-            best = other if other.log >= least else best
+        others = (SLOW, FAST) if self.prior == MOVES else ()
+        fits = (like._fitted(samples, ranks, start, moving) for start in (self.prior, *others))
+        best = first_that_explains(fits, moving, different)
         nats_per_query = like.tempering * best.held / max(1.0, different)
         slow = best.separation >= SURE and spacing.correlation >= SLOW_CHANGES * spacing.detrended
         jump, leave, enter = map(float, best.rates[1:])
@@ -441,6 +438,16 @@ def blocks_together(
 
     still = torch.stack([drive.spacing.still for _, drive in drives]).to(means[0].device)
     yield from sweep(motion, likelihood, queries, still, size)
+
+
+def first_that_explains(fits: Iterator[Fit], moving: float, different: float) -> Fit:
+    """What was found from the first start, or, if that explains little of the queries that are moving, from
+    another speed, if this explains far more of those that are different."""
+    first = next(fits)
+    if first.log >= max(OTHER_SPEED, PER_QUERY * moving):
+        return first
+    other = max(fits, key=lambda one: one.log, default=first)
+    return other if other.log >= max(OTHER_SPEED, PER_QUERY * different, CLEARLY * first.log) else first
 
 
 def rows_of(scores: Tensor) -> Rows:
