@@ -343,15 +343,17 @@ def learn(
 
 
 @torch.no_grad()
-def nats(samples: Sequence[FittedPart], evidence: Evidence, rates: Rates) -> float:
-    """By how much a model beats being off the map."""
-    total = 0.0
+def nats(samples: Sequence[FittedPart], evidence: Evidence, *models: Rates) -> list[float]:
+    """By how much each of some models beats being off the map."""
+    totals = [0.0 for _ in models]
     for sample in samples:
-        motion = sample.over(rates)
-        numbers = range(0, sample.weight.shape[-1], size_of(sample, motion))
-        parts = forward(motion, evidence.likelihood(sample, motion), numbers, sample.still)
-        total += float(sum(part.log.sum() for part in parts))
-    return total
+        normal = RankTable.look_up(evidence.values, sample.std.z)
+        for i, rates in enumerate(models):
+            motion = sample.over(rates)
+            numbers = range(0, sample.weight.shape[-1], size_of(sample, motion))
+            parts = forward(motion, evidence.likelihood(sample, motion, normal), numbers, sample.still)
+            totals[i] += float(sum(part.log.sum() for part in parts))
+    return totals
 
 
 def normalised(mass: Tensor) -> Tensor:

@@ -72,7 +72,7 @@ def place_flight(
 
         given = SEPARATION, LEAST_SEPARATION, tempering
         rates, separation, values = learn([sample], ranks, Rates(kernel / kernel.sum(), *rare), given, again)
-        log = nats([sample], Evidence(values, separation, tempering), rates)
+        (log,) = nats([sample], Evidence(values, separation, tempering), rates)
         return Fit(rates, separation, values, log, log)
 
     moving = float((~sample.still).sum())

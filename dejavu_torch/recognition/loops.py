@@ -195,16 +195,17 @@ def _counted(
         one, other, off = scratch[0], scratch[1], after[t, n]
         one[:] = after[t, :n]
         for v in range(out.shape[1]):
-            total = off * _product(start, lost[v])
-            if not plain:
-                total += _product(start, one)
-                _shifted(one, route, True, other)
-                one, other = other, one
-            elif v < width:
+            if plain:  # only the last places are left
+                last, total = max(0, width - v), np.float32(0)
                 for d in range(keep.shape[0]):
                     own, later = start[d * width : d * width + width], one[d * width : d * width + width]
-                    total += _product(own[: width - v], later[v:])
-            out[t, v] = total
+                    total += _product(own[:last], later[width - last :])
+                    total += off * _product(own[last:], lost[v, d * width + last : d * width + width])
+                out[t, v] = total
+            else:
+                out[t, v] = _product(start, one) + off * _product(start, lost[v])
+                _shifted(one, route, True, other)
+                one, other = other, one
 
 
 def _masses(before: Floats, likelihood: Floats, after: Floats, own: Floats, others: Floats) -> None:

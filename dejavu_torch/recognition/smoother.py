@@ -364,8 +364,8 @@ class PlaceSmoother(SequenceModel):
         evidence = self.first_separation, MIN_SEPARATION, self.tempering
         rates, separation, values = learn(samples, ranks, Rates(prior, *rare), evidence, again)
         found = Evidence(values, separation, self.tempering)
-        each = (nats(samples, found, one) for one in (rates, rates._replace(jump=rare[0], leave=rare[1])))
-        return Fit(rates, separation, values, *each)
+        log, held = nats(samples, found, rates, rates._replace(jump=rare[0], leave=rare[1]))
+        return Fit(rates, separation, values, log, held)
 
     @torch.no_grad()
     def settled(self) -> Facts:

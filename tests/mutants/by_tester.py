@@ -1174,8 +1174,8 @@ MUTANTS = [
     Mutant(
         "A motion learns from steps that leave the end of a route.",
         "dejavu_torch/recognition/loops.py",
-        "total = off * _product(start, lost[v])",
-        "total = np.float32(0)",
+        "total += off * _product(own[last:]",
+        "total += 0 * _product(own[last:]",
         ("tests/recognition/test_engine.py::-k loops",),
     ),
     Mutant(
