@@ -58,9 +58,8 @@ class PlaneMotion(Motion):
         return torch.cat([back, enter * anywhere + (1 - enter) * off], 1).view_as(message)
 
     def anywhere(self) -> Tensor:
-        off = (self.rates.leave / (self.rates.leave + self.rates.enter).clamp(min=MIN_PROBABILITY)).clamp(
-            max=0.5
-        )
+        _, _, leave, enter = self.rates
+        off = (leave / (leave + enter).clamp(min=MIN_PROBABILITY)).clamp(max=0.5)
         return torch.cat([((1 - off) * self.even).expand(self.layout.rows * self.layout.columns), off[None]])
 
     def counts(self, before: Tensor, after: Tensor) -> Counts:
@@ -95,9 +94,11 @@ class PlaneMotion(Motion):
 
     def _bordered(self, on: Tensor, off: Tensor) -> Tensor:
         """Messages, with those of being off the area around them, (B, 1, R + 2 V, C + 2 V)."""
-        off = off[..., None]
+        v, off = self.reach, off[..., None]
         on = on if self.inside is None else torch.where(self.inside > 0, on, off)
-        return (F.pad(on - off, (self.reach,) * 4) + off)[:, None]
+        around = off.repeat(1, on.shape[1] + 2 * v, on.shape[2] + 2 * v)
+        around[:, v : v + on.shape[1], v : v + on.shape[2]] = on
+        return around[:, None]
 
 
 class ByPlace(PlaneMotion):
