@@ -11,6 +11,7 @@ from dataclasses import fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeVar, cast
 
+import torch
 from torch import Tensor, nn
 from torch.nn.parameter import is_lazy
 
@@ -612,7 +613,9 @@ class DejaVu(nn.Module):
         surely have come back."""
         first, count, copies = 0, min(FIRST, len(drive)), len(views.shifts)
         if loops is not None:
-            alone = Earlier(self.scorer(self.described(drive)), loops)
+            place_map = cast(SpectralMap, self.map)  # which has seen the drive
+            rows = torch.cat([place_map.decode(chunk) for chunk in range(len(place_map.chunks))])
+            alone = Earlier(self.scorer(rows), loops)
             sure = confidence(best_pairs(alone, 1, len(drive))).nan_to_num(0, -1e3, -1e3)
             first = int(sure.unfold(0, count, 1).mean(1).argmax())
         some = Part(drive, range(first, first + count))

@@ -440,6 +440,10 @@ def test_some_places_have_the_scores_that_all_have(metric):
     queries, places = torch.randn(7, 12), torch.randint(90, (7, 3))
     expected = route.scores(queries).gather(1, places)
     assert torch.allclose(route.scores_at(queries, places), expected, atol=1e-5)
+    many = queries.repeat(3, 1).double()  # more than the descriptors have numbers
+    found = route.scores_at(many, places.repeat(3, 1))
+    assert found.dtype == torch.float64
+    assert torch.allclose(found, expected.repeat(3, 1).double(), atol=1e-5)
     shuffled = Reordered(OfMap(route, queries), torch.randperm(90))
     expected = shuffled.rows(torch.arange(7)).gather(1, places)
     assert torch.allclose(shuffled.at(torch.arange(7), places), expected, atol=1e-5)

@@ -145,7 +145,8 @@ class Descriptor(nn.Module):
             if hasattr(traverse, "shifts")
             else feature_batches(traverse, self, size, *settings)
         )
-        if self.known is None:
+        once = len(getattr(traverse, "shifts", ())) > 1  # copies are made anew each time
+        if self.known is None or once:
             return self._set_aside(batches, traverse) if id(traverse) in self.aside else batches
         key = traverse.name if isinstance(traverse, AugmentedFrames) else id(traverse)
         if key not in self.known:

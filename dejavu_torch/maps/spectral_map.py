@@ -29,6 +29,7 @@ AGREE = 0.5  # of what differs between places, between two visits to one
 MIN_NORM = 1e-6  # of the RMS norm in a chunk, or of the mean's norm: shorter descriptors count as 0
 STRONGEST = 10  # periods in a summary
 LARGEST = 2**31 - 1  # places of a map, or its coefficients, for int32
+GATHERED = 2**12  # queries that are compared with a place each at a time
 NUMBERS_AT_ONCE = 2**19  # numbers computed at a time, to stay in the processor's cache
 LONG = 2**22  # numbers of a long chunk computed at a time
 TOGETHER = 16  # queries multiplied with lines at a time, at least
@@ -476,21 +477,31 @@ class SpectralMap(PlaceMap):
 
         Inverse transforms of products with the lines: O(lines + W log W) per query, not O(W K). No autocast.
         """
-        if len(self.stage):
-            queries = (queries * self.stage_scale.to(queries)) @ self.stage.to(queries).T
-        return self._all_products(queries, chunks)
+        return self._all_products(self._to_stage(queries), chunks)
+
+    def _to_stage(self, queries: Tensor) -> Tensor:
+        """Queries of which inner products with the lines are those of staged descriptors."""
+        if not len(self.stage):
+            return queries
+        return (queries * self.stage_scale.to(queries)) @ self.stage.to(queries).T
 
     def products_at(self, queries: Tensor, places: Tensor) -> Tensor:
         """As `products`, at some places of each query, -inf at those below 0: (Q,K), (Q,M) -> (Q,M)."""
-        found = torch.full(places.shape, -math.inf, dtype=torch.float32, device=places.device)
+        found = torch.full(places.shape, -math.inf, dtype=queries.dtype, device=places.device)
         starts = torch.tensor([start for start, _ in self.chunks], device=places.device)
         chunk = torch.bucketize(places, starts, right=True) - 1
         for g in chunk.unique().tolist():
             if g >= 0:
                 query, column = (chunk == g).nonzero().T
                 some, row = query.unique_consecutive(return_inverse=True)
-                here = self.products(queries[some], range(g, g + 1))
-                found[query, column] = here[row, places[query, column] - self.chunks[g][0]]
+                at = places[query, column] - self.chunks[g][0]
+                if len(some) > self.dimension:  # fewer transforms
+                    own, rows = self._to_stage(queries), self.decode(g).to(queries)
+                    pairs = zip(query.split(GATHERED), at.split(GATHERED), strict=True)
+                    each = [(own[some] * rows[near]).sum(1) for some, near in pairs]
+                    found[query, column] = torch.cat(each)
+                else:
+                    found[query, column] = self.products(queries[some], range(g, g + 1))[row, at]
         return found
 
     def _all_products(self, queries: Tensor, chunks: range) -> Tensor:

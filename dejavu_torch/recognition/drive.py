@@ -20,6 +20,7 @@ from dejavu_torch.recognition.evidence import Spacing, spacing_of
 from dejavu_torch.recognition.filter import near_scores
 from dejavu_torch.recognition.flight import place_flight
 from dejavu_torch.recognition.large import TILE, LargeDrive, is_large
+from dejavu_torch.recognition.motion import AlongRoute
 from dejavu_torch.recognition.plane import FLOWN
 from dejavu_torch.recognition.scorer import Cached, Scorer
 from dejavu_torch.recognition.select import best_candidates
@@ -31,7 +32,7 @@ from dejavu_torch.recognition.smoother import (
 )
 from dejavu_torch.recognition.taken import ALONE, FEW, SURER, UPPER, doubted, singly
 from dejavu_torch.text import progress_of
-from dejavu_torch.types import Match
+from dejavu_torch.types import Match, expect
 
 DOUBT = 0.1  # nats for each deviation by which an answer's own score is worse than is usual in the drive
 SCORES_KEPT = 2**26  # scores of drives that are smoothed together, up to which they are computed once
@@ -203,6 +204,8 @@ def _seen(
         descriptors, layout = scorer.descriptors, scorer.layout
         along = _of_windows if is_large(len(scorer), layout.places) else None
         if alone := {1: along, 2: _of_flight}[layout.dimensions]:
+            seen = f"a motion of one's own, and {len(scorer)} queries on {layout.places} places"
+            expect(smoother.motion is AlongRoute, "fewer, along a route", seen)
             fitted_one(1)
             yield from ((i, known, seen) for known, seen in alone(asked, progress))
             continue

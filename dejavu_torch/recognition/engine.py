@@ -117,8 +117,8 @@ class Motion(ABC):
             Beliefs before each query (..., B, S), log likelihoods (..., B), and the last belief.
         """
         before, totals = [], []
-        for t, seen in enumerate(likelihood.unbind(-2)):
-            belief = self._unless(still[..., t], self.moved, belief)
+        for t, (seen, rests) in enumerate(zip(likelihood.unbind(-2), at_rest_in(still), strict=True)):
+            belief = self._unless(still[..., t], rests, self.moved, belief)
             before.append(belief.expand_as(seen))
             joint = belief * seen
             total = joint.sum(-1, keepdim=True)
@@ -129,23 +129,23 @@ class Motion(ABC):
     def behind(self, message: Tensor, likelihood: Tensor, still: Tensor) -> tuple[Tensor, Tensor]:
         """Backward over some queries: messages (..., S) of those after the last one -> (..., B, S) of those
         after each, and that of the first and all after it."""
-        after = []
+        after, rests = [], at_rest_in(still)
         for t in reversed(range(likelihood.shape[-2])):
             after.append(message)
             message = message * likelihood[..., t, :]
             message = message / message.amax(-1, keepdim=True)
-            message = self._unless(still[..., t], self.expected, message)
+            message = self._unless(still[..., t], rests[t], self.expected, message)
         return torch.stack(after[::-1], -2), message
 
     @staticmethod
-    def _unless(still: Tensor, step: Callable[[Tensor], Tensor], belief: Tensor) -> Tensor:
-        if not still.any():
+    def _unless(still: Tensor, rests: int, step: Callable[[Tensor], Tensor], belief: Tensor) -> Tensor:
+        if not rests:
             return step(belief)
-        return belief if still.all() else torch.where(still[..., None], belief, step(belief))
+        return belief if rests == still.numel() else torch.where(still[..., None], belief, step(belief))
 
 
 class Block(NamedTuple):
-    """Consecutive queries from `first` on, of a sweep: (..., B, S) each, as `States` numbers them.
+    """Consecutive queries from `first` on, of a sweep: (..., B, S) each, as a motion numbers states.
 
     before: beliefs given the queries before each. likelihood: of each query, 1 off the map. after: messages
     of the queries after each, of any scale. log: (..., B), likelihood of each query given those before.
@@ -215,6 +215,12 @@ def at_rest(still: Tensor, first: int, last: int) -> Tensor:
     """Which of the queries [first, last) the camera does not move to; the first of all is none."""
     rests = still[..., first:last]
     return rests if first else torch.cat([torch.ones_like(rests[..., :1]), rests[..., 1:]], -1)
+
+
+def at_rest_in(still: Tensor) -> list[int]:
+    """In how many drives the camera does not move to each query, (..., B) -> B numbers, read at once."""
+    counts: list[int] = still.reshape(-1, still.shape[-1]).sum(0).tolist()
+    return counts
 
 
 class FittedPart(NamedTuple):

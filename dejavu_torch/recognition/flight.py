@@ -31,7 +31,7 @@ from dejavu_torch.recognition.taken import moves_along
 SEPARATION, LEAST_SEPARATION = 3.0, 1.0  # standard deviations of scores
 SPREADS = 2.0, 0.7, 4.0  # windows that a step goes in each direction, and where that explains little
 FITTED = 300  # queries in a row, from the middle, that a smoother is fitted to
-BYTES = 70  # of memory for each query and window
+BYTES = 45  # of memory for each query and window
 
 
 @torch.no_grad()
@@ -50,6 +50,8 @@ def place_flight(
     cells = layout.rows * layout.columns
     check_room(BYTES * queries * cells, f"a drive of {queries} images over {cells} rows x columns")
     scores = rows(torch.arange(queries)).float().cpu()
+    if not queries:
+        return scores, smoother.forgetful()
     weight = spacing.weight.to(scores)
     means = smoother.removed * place_means(scores, weight)
     std, ranks = standardised(scores, means), RankTable()

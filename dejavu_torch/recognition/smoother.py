@@ -83,7 +83,8 @@ class PlaceSmoother(SequenceModel):
         threshold: accept a match if its score is below; None leaves it to `DejaVu.acceptance`.
         links: further steps (from, to, probability) in place of that to the next place.
         loop: the last place leads to the first one.
-        motion: a kind of motion of one's own, which is made of `States` and `Rates`.
+        motion: a kind of motion of one's own along a route, which is made of `States` and `Rates`; not for
+            large maps, which are searched in parts.
 
     Shape: scores (..., Q, N) -> (..., Q, N), -log of a probability in nats. Descriptors (Q,K), where given,
         tell how the queries depend on each other; else the scores tell it.
@@ -224,7 +225,7 @@ class PlaceSmoother(SequenceModel):
             states.append(int(reached.argmax()))
         state, n = torch.tensor(states[::-1], dtype=torch.int64), scores.shape[1]
         place = torch.where(state < n, state, 2 * n - 1 - state)
-        return torch.where(state < 2 * n, place, -1)
+        return torch.where(state < motion.states.directions * n, place, -1)
 
     def steps(self, places: int, route_starts: Sequence[int], like: Tensor) -> Motion:
         """The transitions of a map, in the type of its scores."""

@@ -635,7 +635,7 @@ MUTANTS = [
     Mutant(
         "Within a stop nothing moves, in either pass.",
         "dejavu_torch/recognition/engine.py",
-        "message = self._unless(still[..., t], self.expected, message)",
+        "message = self._unless(still[..., t], rests[t], self.expected, message)",
         "message = self.expected(message)",
         ("tests/recognition/test_smoother.py::-k moves_nowhere",),
     ),

@@ -12,10 +12,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from test_motion import matrix_of, motion_of, steps_of
 
+from dejavu_torch.places.layout import Layout
 from dejavu_torch.places.states import States
 from dejavu_torch.recognition import motion as motions
 from dejavu_torch.recognition.engine import Block, Motion, Rates, normalised, sweep
+from dejavu_torch.recognition.localizer import Matching, answer
 from dejavu_torch.recognition.motion import AlongRoute
+from dejavu_torch.recognition.scorer import OfRows
 from dejavu_torch.recognition.smoother import PlaceSmoother
 
 NUMBA = importlib.util.find_spec("numba") is not None
@@ -108,6 +111,25 @@ def test_a_smoother_moves_as_it_is_told():
     assert float(smoother.log_evidence(scores)) == pytest.approx(total)
     with refused("the motion is a Stairs", "along a route"):
         smoother.path(scores)
+    area = OfRows(scores.__getitem__, scores, Layout(1, 7))
+    with refused("motion of one's own, and 9 queries on 7 places", "along a route"):
+        answer(area, Matching(smoother))
+
+
+def test_the_path_of_a_camera_that_never_turns_leaves_the_map():
+    class OneWay(AlongRoute):
+        directions = 1
+
+    scores = torch.rand(30, 12, generator=torch.Generator().manual_seed(0))
+    for motion in (AlongRoute, OneWay):
+        assert (PlaceSmoother(leave=0.5, enter=0.0, separation=9.0, motion=motion).path(scores) == -1).all()
+
+
+def test_no_images_over_an_area_have_no_answers():
+    none = torch.zeros(0, 4)
+    assert (
+        len(answer(OfRows(lambda _: torch.zeros(0, 12), none, Layout(3, 4)), Matching(PlaceSmoother()))) == 0
+    )
 
 
 def test_gradients_go_through_torch(monkeypatch):
