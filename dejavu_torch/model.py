@@ -536,7 +536,7 @@ class DejaVu(nn.Module):
         centres &= whole or sequence is None
         querying = self.looking(queries, querying, ordered, centres)
         matching = matching._replace(k=querying.top, radius=apart, wrappers=querying.wrappers)
-        copies, asked = querying.copies_of(queries, self.map.layout), (queries, querying)
+        copies = querying.copies_of(queries, self.map.layout)
         shape, name, turned = queries.frame_shape, queries.name, is_turned(copies)
 
         def on_first(frames: Tensor, features: Tensor) -> None:
@@ -550,7 +550,7 @@ class DejaVu(nn.Module):
             batches = self.descriptor.batches(copies, progress, "localizing", on_first)
             yield from map(localizer, (set_apart(self.map, rows) if turned else rows for rows in batches))
             return
-        descriptors = self.described(*asked, centres, progress, on_first)
+        descriptors = self.described(queries, querying, centres, progress, on_first)
         yield answer(self.scorer(descriptors, matching), matching, progress)
 
     def described(
@@ -596,10 +596,8 @@ class DejaVu(nn.Module):
             queries: as they are, described as the map's frames. ordered: one drive. centre: see `localize`.
         """
         images, learns = len(queries.frame_shape) == 3, ordered and len(queries) >= LEAST
-        views, loops = (
-            self.views_at_first(querying, images and querying.headings == 1, learns),
-            querying.loops,
-        )
+        views = self.views_at_first(querying, images and querying.headings == 1, learns)
+        loops = querying.loops
         given = querying.fov is not None or not isinstance(querying.shifts, str)
         if views == ALONE or (given and loops is None):
             return replace(querying, views=views)

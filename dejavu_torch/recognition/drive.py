@@ -205,7 +205,7 @@ def _seen(
         along = _of_windows if is_large(len(scorer), layout.places) else None
         if alone := {1: along, 2: _of_flight}[layout.dimensions]:
             seen = f"a motion of one's own, and {len(scorer)} queries on {layout.places} places"
-            expect(smoother.motion is AlongRoute, "fewer, along a route", seen)
+            expect(smoother.motion is AlongRoute, "a route of fewer places", seen)
             fitted_one(1)
             yield from ((i, known, seen) for known, seen in alone(asked, progress))
             continue

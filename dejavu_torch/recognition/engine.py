@@ -212,7 +212,7 @@ def sweep(motion: Motion, likelihood: Likelihood, queries: int, still: Tensor, s
 
 
 def at_rest(still: Tensor, first: int, last: int) -> Tensor:
-    """Which of the queries [first, last) the camera does not move to; the first of all is none."""
+    """Which of the queries [first, last) the camera does not move to: also the first of all."""
     rests = still[..., first:last]
     return rests if first else torch.cat([torch.ones_like(rests[..., :1]), rests[..., 1:]], -1)
 

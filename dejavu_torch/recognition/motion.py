@@ -153,7 +153,8 @@ class AlongRoute(Motion):
     ) -> tuple[Tensor, Tensor, Tensor] | None:
         """What a loop finds, (..., B, S), (..., B) and (..., S); None if torch has to compute it."""
         *drives, queries, states = likelihood.shape
-        if likelihood.numel() < WORTH_COMPILING:
+        own_steps = (type(self).moved, type(self).expected) != (AlongRoute.moved, AlongRoute.expected)
+        if likelihood.numel() < WORTH_COMPILING or own_steps:  # of a kind of motion that changes them
             return None
         count = math.prod(drives)
         each = (torch.stack(self.moves, -3)[..., 0, 0], self.free, self.gone)

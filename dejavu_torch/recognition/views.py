@@ -187,7 +187,13 @@ def penalties_of(
 ) -> Tensor:
     """The penalty of each view, (V,), by the `best_pairs` of queries: the fewer of the surest answers a view
     gives, the more it costs, and +inf if these are hardly more than by chance. Moved views are left out
-    unless answers then follow each other more often."""
+    unless answers then follow each other more often.
+
+    Args:
+        start: penalty of moved views to begin with. nats: penalty for each nat by which a view is rarer.
+        chance: share of the surest answers below which a view is left out. more: share of the queries whose
+            answers have to follow each other more often with moved views.
+    """
     each = min(2, layout.places)
     copies = pairs.score.shape[1] // each
     alone = torch.full((copies,), math.inf).index_fill(0, torch.tensor(0), 0.0)

@@ -112,7 +112,7 @@ def test_a_smoother_moves_as_it_is_told():
     with refused("the motion is a Stairs", "along a route"):
         smoother.path(scores)
     area = OfRows(scores.__getitem__, scores, Layout(1, 7))
-    with refused("motion of one's own, and 9 queries on 7 places", "along a route"):
+    with refused("motion of one's own, and 9 queries on 7 places", "a route of fewer places"):
         answer(area, Matching(smoother))
 
 
@@ -123,6 +123,19 @@ def test_the_path_of_a_camera_that_never_turns_leaves_the_map():
     scores = torch.rand(30, 12, generator=torch.Generator().manual_seed(0))
     for motion in (AlongRoute, OneWay):
         assert (PlaceSmoother(leave=0.5, enter=0.0, separation=9.0, motion=motion).path(scores) == -1).all()
+
+
+@pytest.mark.skipif(not NUMBA, reason="numba is not installed")
+def test_no_loop_replaces_steps_of_ones_own(monkeypatch):
+    class Slower(AlongRoute):
+        def moved(self, belief):
+            return (belief + super().moved(belief)) / 2
+
+    monkeypatch.setattr(motions, "WORTH_COMPILING", 1)
+    slower = Slower(States(5, 2), Rates(torch.tensor([0.2, 0.8]), *torch.tensor([0.01, 0.01, 0.1])))
+    belief, still = torch.eye(11)[2], torch.zeros(1, dtype=torch.bool)
+    before, *_ = slower.ahead(belief, torch.ones(1, 11), still)
+    assert torch.allclose(before[0], slower.moved(belief))
 
 
 def test_no_images_over_an_area_have_no_answers():
