@@ -649,8 +649,8 @@ MUTANTS = [
     Mutant(
         "A drive far faster than the reference is found.",
         "dejavu_torch/recognition/smoother.py",
-        "for start in (SLOW, FAST)",
-        "for start in (SLOW, SLOW)",
+        "others = (SLOW, FAST)",
+        "others = (SLOW, SLOW)",
         ("tests/recognition/test_smoother.py::-k any_kind",),
     ),
     Mutant(
