@@ -12,7 +12,7 @@ from torch import Tensor
 
 from dejavu_torch.maps.place_map import PlaceMap
 from dejavu_torch.places.layout import ROUTE, Layout
-from dejavu_torch.recognition.engine import folded
+from dejavu_torch.recognition.engine import normalised
 from dejavu_torch.recognition.filter import PlaceFilter, moments_of
 from dejavu_torch.recognition.select import best_candidates, best_match
 from dejavu_torch.recognition.smoother import Drive, PlaceSmoother
@@ -291,8 +291,7 @@ def calibrated_by_drive(
     answers = [torch.cat(found[0]) for found in (single, filtered)]
     right: tuple[list[Tensor], list[Tensor]] = [], []
     for block in smoother.blocks(drive, layout.starts):
-        others = folded(block.before * block.after, layout.places).cpu().double()
-        others = (others / others.sum(1, keepdim=True))[:, :-1]
+        others = normalised(block.motion.folded(block.others.cpu().double()))[:, :-1]
         own = slice(block.first, block.first + len(others))
         for masses, index in zip(right, answers, strict=True):
             near = layout.mass_near(others, index[own].clamp(min=0), TOLERANCE)

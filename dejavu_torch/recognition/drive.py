@@ -15,7 +15,7 @@ from dejavu_torch.memory import in_one_thread
 from dejavu_torch.places.layout import ROUTE
 from dejavu_torch.places.states import States
 from dejavu_torch.recognition.calibration import Platt, best_pair, confidence, confidence_of
-from dejavu_torch.recognition.engine import Motion, folded, normalised
+from dejavu_torch.recognition.engine import Motion
 from dejavu_torch.recognition.evidence import Spacing, spacing_of
 from dejavu_torch.recognition.filter import near_scores
 from dejavu_torch.recognition.flight import place_flight
@@ -229,8 +229,8 @@ def _seen(
         pairs = [(asked.smoother, drive) for _, asked, drive in alike]
         for block in blocks_together(pairs, drives[alike[0][0]].scorer.layout.starts):
             numbers = torch.arange(block.first, block.first + block.log.shape[-1])
-            for (i, asked, drive), posterior in zip(alike, block.posterior, strict=True):
-                yield i, asked, Seen(_mass(posterior, states.places), drive.rows(numbers).cpu())
+            for (i, asked, drive), mass in zip(alike, block.by_place, strict=True):
+                yield i, asked, Seen(mass, drive.rows(numbers).cpu())
 
 
 def _of_flight(asked: DriveQuery, progress: bool) -> Iterator[tuple[DriveQuery, Seen]]:
@@ -247,18 +247,13 @@ def _of_windows(asked: DriveQuery, progress: bool) -> Iterator[tuple[DriveQuery,
     scorer, places = asked.scorer, asked.scorer.layout.places
     drive = LargeDrive(scorer, asked.smoother, max(2, asked.k), asked.radius, progress)
     asked = asked.fitted(drive.smoother, drive.spacing)
-    for first, posterior, scores, known in drive:
-        mass = _mass(posterior, len(known))
+    for first, mass, scores, known in drive:
         if asked.answers:
             yield asked, Seen(mass, scores, known)
             continue
         for part in reversed(torch.arange(len(mass)).split(max(1, TILE // places))):
             whole = mass.new_zeros(len(part), places).index_copy(1, known, mass[part])
             yield asked, Seen(whole, scorer.rows(first + part).cpu())
-
-
-def _mass(posterior: Tensor, places: int) -> Tensor:
-    return normalised(folded(posterior.cpu().double(), places))[:, :-1]
 
 
 def doubt(own: Tensor) -> Tensor:

@@ -59,7 +59,8 @@ class Motion(ABC):
 
     def __init__(self, states: States, rates: Rates) -> None:
         self.states, self.rates = states, rates
-        self.each = states.share / max(1, states.directions * states.places)
+        # the share of each place of what goes anywhere
+        self.each: float | Tensor = states.share / max(1, states.directions * states.places)
 
     @abstractmethod
     def moved(self, belief: Tensor) -> Tensor:
@@ -94,13 +95,28 @@ class Motion(ABC):
 
     def folded(self, mass: Tensor) -> Tensor:
         """Mass of all states (..., S) -> of the places, whichever way, and off the map, (..., N+1)."""
-        return folded(mass, self.states.places)
+        if self.states.directions == 1:
+            return mass
+        places = self.states.places
+        return torch.cat([mass[..., :places] + mass[..., places:-1].flip(-1), mass[..., -1:]], -1)
 
-    def masses(self, block: Block) -> tuple[Tensor, Tensor]:
-        """Of each query, the mass of the places, and without its own evidence: (..., B, N) each."""
-        each = block.posterior, normalised(block.before * block.after)
-        own, others = (self.folded(one)[..., :-1] for one in each)
-        return own, others
+    def told(
+        self, block: Block, std: Standardised, normal: Tensor, shares: Tensor, table: RankTable
+    ) -> Tensor:
+        """What a block tells of the scores: right ones, and those near them, are taken from the table.
+
+        Args:
+            std: of its queries. normal: their normal scores (..., B, N). shares: (..., B), what each counts.
+
+        Returns:
+            (2,): the sum of the normal scores of right places, without the query's own evidence, so that this
+            is not mistaken for that of its place, and the mass of these.
+        """
+        own, others = (self.folded(one)[..., :-1] for one in (block.posterior, normalised(block.others)))
+        shares = shares[..., None]
+        table.add(std.z, std.only(-shares * self.near(own, RADIUS), 0))
+        others = others * shares
+        return torch.stack([(others * std.only(normal, 0)).sum(), others.sum()])
 
     def near(self, mass: Tensor, radius: int) -> Tensor:
         """The mass of each place and its neighbours up to a radius, (..., N) -> (..., N)."""
@@ -149,6 +165,7 @@ class Block(NamedTuple):
 
     before: beliefs given the queries before each. likelihood: of each query, 1 off the map. after: messages
     of the queries after each, of any scale. log: (..., B), likelihood of each query given those before.
+    motion: which numbers the states.
     """
 
     first: int
@@ -156,10 +173,22 @@ class Block(NamedTuple):
     likelihood: Tensor
     after: Tensor
     log: Tensor
+    motion: Motion
 
     @property
     def posterior(self) -> Tensor:
-        return normalised(self.before * self.likelihood * self.after)
+        """Probabilities of the states."""
+        return normalised(self.others * self.likelihood)
+
+    @property
+    def by_place(self) -> Tensor:
+        """Probabilities of the places, (..., B, N), in double precision, so that those nearly sure differ."""
+        return normalised(self.motion.folded(self.posterior.cpu().double()))[..., :-1]
+
+    @property
+    def others(self) -> Tensor:
+        """The mass of the states without each query's own evidence."""
+        return self.before * self.after
 
 
 class Ahead(NamedTuple):
@@ -208,7 +237,7 @@ def sweep(motion: Motion, likelihood: Likelihood, queries: int, still: Tensor, s
             message = torch.ones_like(part.likelihood[..., -1, :])
         rests = at_rest(still, first, first + part.likelihood.shape[-2])
         after, message = motion.behind(message, part.likelihood, rests)
-        yield Block(part.first, part.before, part.likelihood, after, part.log)
+        yield Block(part.first, part.before, part.likelihood, after, part.log, motion)
 
 
 def at_rest(still: Tensor, first: int, last: int) -> Tensor:
@@ -291,14 +320,14 @@ def explained(
     normal: Tensor | None = None,
 ) -> Iterator[Block]:
     """What follows from a sample, in blocks of `size` queries, the last first."""
-    queries, size = sample.weight.shape[-1], size or size_of(sample, motion)
+    queries, size = sample.weight.shape[-1], size or size_of(motion, sample.weight)
     yield from sweep(motion, evidence.likelihood(sample, motion, normal), queries, sample.still, size)
 
 
-def size_of(sample: FittedPart, motion: Motion) -> int:
-    """Queries of a block."""
-    *lead, _ = sample.weight.shape
-    return max(1, NUMBERS_AT_ONCE // (math.prod(lead) * motion.anywhere().shape[-1]))
+def size_of(motion: Motion, still: Tensor) -> int:
+    """Queries of a block, of drives (..., Q): about the root of their number, or more if they are small."""
+    *lead, queries = still.shape
+    return max(1, math.isqrt(queries), NUMBERS_AT_ONCE // (math.prod(lead) * motion.anywhere().shape[-1]))
 
 
 @torch.no_grad()
@@ -328,13 +357,8 @@ def learn(
             for block in explained(sample, Evidence(values, separation, tempering), motion, None, normal):
                 first, last = block.first, block.first + block.log.shape[-1]
                 std, weight, *_ = sample.part(first, last)
-                shares = (weight * std.speaks)[..., None]
-                own, others = motion.masses(block)
-                table.add(std.z, std.only(-shares * motion.near(own, RADIUS), 0))  # right ones
-                # without its own evidence, that of a query is not mistaken for that of its place
-                others = others * shares
-                known = std.only(normal.narrow(-2, first, last - first), 0)
-                sums += torch.stack([(others * known).sum(), others.sum()])
+                known = normal.narrow(-2, first, last - first)
+                sums += motion.told(block, std, known, weight * std.speaks, table)
                 belief, after = block.before * block.likelihood, block.likelihood * block.after
                 later = after[..., 1:, :] if later is None else torch.cat([after[..., 1:, :], later], -2)
                 pair = belief[..., : later.shape[-2], :], later
@@ -356,7 +380,7 @@ def nats(samples: Sequence[FittedPart], evidence: Evidence, *models: Rates) -> l
         normal = RankTable.look_up(evidence.values, sample.std.z)
         for i, rates in enumerate(models):
             motion = sample.over(rates)
-            numbers = range(0, sample.weight.shape[-1], size_of(sample, motion))
+            numbers = range(0, sample.weight.shape[-1], size_of(motion, sample.weight))
             parts = forward(motion, evidence.likelihood(sample, motion, normal), numbers, sample.still)
             totals[i] += float(sum(part.log.sum() for part in parts))
     return totals
@@ -365,14 +389,6 @@ def nats(samples: Sequence[FittedPart], evidence: Evidence, *models: Rates) -> l
 def normalised(mass: Tensor) -> Tensor:
     """Mass (..., S) that adds up to 1."""
     return mass / mass.sum(-1, keepdim=True)
-
-
-def folded(mass: Tensor, places: int) -> Tensor:
-    """Mass of the places in one or two directions, and off the map, (..., S) -> of the places whichever way,
-    and off the map, (..., N+1)."""
-    if mass.shape[-1] == places + 1:
-        return mass
-    return torch.cat([mass[..., :places] + mass[..., places:-1].flip(-1), mass[..., -1:]], -1)
 
 
 def near_mass(mass: Tensor, radius: int) -> Tensor:

@@ -12,7 +12,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from dejavu_torch.recognition.engine import Evidence, FittedPart, explained, folded
+from dejavu_torch.recognition.engine import Evidence, FittedPart, explained
 from dejavu_torch.recognition.evidence import (
     MIN_SHARE,
     RankTable,
@@ -167,7 +167,7 @@ class LargeDrive:
         top = torch.zeros(count, best.shape[1])
         with progress_of("searching", self.queries, self.progress, "query") as update:
             for block in coarse.blocks(coarse.drive(rows, self.scorer.descriptors), starts):
-                mass = folded(block.posterior, best.shape[1])[:, :-1]
+                mass = block.motion.folded(block.posterior)[:, :-1]
                 for looked, (start, stop) in zip(top, around, strict=True):
                     some = slice(max(0, start - block.first), max(0, stop - block.first))
                     if len(mass[some]):
@@ -243,8 +243,8 @@ class LargeDrive:
 
     @torch.no_grad()
     def __iter__(self) -> Iterator[tuple[int, Tensor, Tensor, Tensor]]:
-        """The first query of each window, the last window first; the posterior (B, 2 n + 1) and scores (B,n)
-        of some places (n,)."""
+        """The first query of each window, the last window first; the mass and scores (B,n) of some places
+        (n,)."""
         smoother = self.smoother
         rates = smoother.rates(self.means)
         for window in self.windows[::-1]:
@@ -254,4 +254,4 @@ class LargeDrive:
             own = slice(window.first - window.start, window.last - window.start)
             z = window.z[own].float() * self.spread[window.first : window.last, None]
             scores = self.means[window.places] - z + self.mean[window.first : window.last, None]
-            yield window.first, block.posterior[own], scores, window.places
+            yield window.first, block.by_place[own], scores, window.places

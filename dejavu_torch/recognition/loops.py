@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from dejavu_torch.maps.compiling import Floats, Kernel, compiled
 
 Numbers = NDArray[np.int64]
+Doubles = NDArray[np.float64]
 
 # A route is `keep` (D,N), links as direction, from and to (L,3), with their shares (L,), the probability of a
 # turn, and whether it is plain, without ends or links; a motion, moves (C,V+1), the shares of a state's mass
@@ -24,6 +25,8 @@ SWEPT = f"void({SEEN}, {MOTION}, {ROUTE}, float32[:,:,::1], float32[:,::1])"
 Route = tuple[Floats, Numbers, Floats, float, bool]
 Steps = tuple[Floats, Floats, Floats, float]
 
+
+WORTH_COMPILING = 2**17  # numbers that torch takes longer for than numba does to load
 
 # All loops count from 0 over slices, which the compiler makes vectors of.
 
@@ -208,21 +211,52 @@ def _counted(
                 one, other = other, one
 
 
-def _masses(before: Floats, likelihood: Floats, after: Floats, own: Floats, others: Floats) -> None:
-    """`Motion.masses`, of rows (B,S) in one or two directions."""
-    n = own.shape[1]
-    two = before.shape[1] > n + 1
-    every, plain = np.empty(before.shape[1], np.float32), np.empty(before.shape[1], np.float32)
+def _told(
+    seen: tuple[Floats, Floats, Floats],
+    scores: tuple[Floats, Floats, Floats],
+    table: tuple[float, float, int],
+    counts: Doubles,
+    sums: Doubles,
+) -> None:
+    """`Motion.told`, of before, likelihood and after (B,S), and z and normal scores (B,N) with shares (B,);
+    a table has its lowest z, steps of one, and a radius."""
+    (before, likelihood, after), (z, normal, shares), (lowest, steps, radius) = seen, scores, table
+    n, states = z.shape[1], before.shape[1]
+    every, plain = np.empty(states, np.float32), np.empty(states, np.float32)
+    own, others, last = np.empty(n, np.float32), np.empty(n, np.float32), np.float32(len(counts) - 2)
     for t in range(len(before)):
         _times(before[t], after[t], plain)
         _times(plain, likelihood[t], every)
-        for part, out in ((every, own[t]), (plain, others[t])):
+        for part, out in ((every, own), (plain, others)):
             total = np.float32(0)
-            for i in range(len(part)):
+            for i in range(states):
                 total += part[i]
             _scaled(1 / total, part[:n], out)
-            if two:
+            if states > n + 1:
                 _added(1 / total, part[2 * n - 1 : n - 1 : -1], out)
+        sums[0] += shares[t] * _product(others, normal[t])
+        total = np.float32(0)
+        for i in range(n):
+            total += others[i]
+        sums[1] += shares[t] * total
+        near = 0.0
+        for i in range(-radius, n):
+            if i + radius < n:
+                near += own[i + radius]
+            if i > radius:
+                near -= own[i - radius - 1]
+            if i >= 0:
+                at = min(max((z[t, i] - lowest) * steps, np.float32(0)), last)
+                counts[int(at)] -= shares[t] * min(max(near, 0.0), 1.0)
+
+
+def _looked_up(z: Floats, values: Floats, lowest: float, steps: float, out: Floats) -> None:
+    """The values of a table, one at each of `steps` from `lowest` on, at z (n,), and in between."""
+    last = np.float32(len(values) - 2)
+    for i in range(len(z)):
+        at = min(max((z[i] - lowest) * steps, np.float32(0)), last)  # NaN becomes 0
+        low = int(at)
+        out[i] = values[low] + (at - np.float32(low)) * (values[low + 1] - values[low])
 
 
 FAST = {"reassoc", "nsz", "contract"}  # not "nnan" and "ninf", which lose NaN and infinity
@@ -243,6 +277,12 @@ def behind() -> Kernel | None:
 
 
 @cache
+def looked_up() -> Kernel | None:
+    """`_looked_up` compiled."""
+    return compiled_by(_looked_up, "void(float32[::1], float32[::1], float32, float32, float32[::1])")
+
+
+@cache
 def counted() -> Kernel | None:
     """`_counted` compiled."""
     given = ", ".join(["float32[:,::1]"] * 3)
@@ -250,6 +290,10 @@ def counted() -> Kernel | None:
 
 
 @cache
-def masses() -> Kernel | None:
-    """`_masses` compiled."""
-    return compiled_by(_masses, f"void({', '.join(['float32[:,::1]'] * 5)})")
+def told() -> Kernel | None:
+    """`_told` compiled."""
+    rows, row = "float32[:,::1]", "float32[::1]"
+    given = (
+        f"Tuple(({rows}, {rows}, {rows})), Tuple(({rows}, {rows}, {row})), Tuple((float32, float32, int64))"
+    )
+    return compiled_by(_told, f"void({given}, float64[::1], float64[::1])")

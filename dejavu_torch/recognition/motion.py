@@ -13,11 +13,10 @@ from torch import Tensor
 from dejavu_torch.maps.compiling import Floats, Kernel, floats_of
 from dejavu_torch.places.states import States
 from dejavu_torch.recognition import loops
-from dejavu_torch.recognition.engine import MIN_PROBABILITY, Block, Counts, Motion, Rates
+from dejavu_torch.recognition.engine import MIN_PROBABILITY, RADIUS, Block, Counts, Motion, Rates
+from dejavu_torch.recognition.evidence import LOWEST, PER_DEVIATION, RankTable, Standardised
 from dejavu_torch.recognition.loops import Route
 from dejavu_torch.types import InputError
-
-WORTH_COMPILING = 2**17  # queries x states that torch takes longer for than numba does to load
 
 
 class AlongRoute(Motion):
@@ -137,16 +136,19 @@ class AlongRoute(Motion):
         found = self._run(loops.behind, message, likelihood, still)
         return super().behind(message, likelihood, still) if found is None else (found[0], found[2])
 
-    def masses(self, block: Block) -> tuple[Tensor, Tensor]:
-        if block.before.numel() >= WORTH_COMPILING:
-            each = block.before, block.likelihood, block.after
-            found = [floats_of(one.reshape(-1, one.shape[-1])) for one in each]
-            if all(one is not None for one in found) and (kernel := loops.masses()) is not None:
-                shape = *block.before.shape[:-1], self.states.places
-                own, others = np.empty((2, math.prod(shape[:-1]), shape[-1]), np.float32)
-                kernel(*found, own, others)
-                return torch.from_numpy(own).view(shape), torch.from_numpy(others).view(shape)
-        return super().masses(block)
+    def told(
+        self, block: Block, std: Standardised, normal: Tensor, shares: Tensor, table: RankTable
+    ) -> Tensor:
+        if block.before.numel() >= loops.WORTH_COMPILING and std.valid is None:
+            given = block.before, block.likelihood, block.after, std.z, normal
+            found = [floats_of(one.reshape(-1, one.shape[-1])) for one in given]
+            found.append(floats_of(shares.flatten()))
+            if all(one is not None for one in found) and (kernel := loops.told()) is not None:
+                sums = torch.zeros(2, dtype=torch.float64)
+                binned = LOWEST, PER_DEVIATION, RADIUS
+                kernel((*found[:3],), (*found[3:],), binned, table.counts.numpy(), sums.numpy())
+                return sums.to(normal)
+        return super().told(block, std, normal, shares, table)
 
     def _run(
         self, loop: Callable[[], Kernel | None], start: Tensor, likelihood: Tensor, still: Tensor
@@ -154,7 +156,7 @@ class AlongRoute(Motion):
         """What a loop finds, (..., B, S), (..., B) and (..., S); None if torch has to compute it."""
         *drives, queries, states = likelihood.shape
         own_steps = (type(self).moved, type(self).expected) != (AlongRoute.moved, AlongRoute.expected)
-        if likelihood.numel() < WORTH_COMPILING or own_steps:  # of a kind of motion that changes them
+        if likelihood.numel() < loops.WORTH_COMPILING or own_steps:  # of a kind of motion that changes them
             return None
         count = math.prod(drives)
         each = (torch.stack(self.moves, -3)[..., 0, 0], self.free, self.gone)
@@ -233,7 +235,7 @@ class AlongRoute(Motion):
 
     def _counted(self, before: Tensor, after: Tensor, lost: Tensor) -> Tensor | None:
         """The weight of each move without its probability, (..., V+1), by a loop of `loops`."""
-        if before.numel() < WORTH_COMPILING:
+        if before.numel() < loops.WORTH_COMPILING:
             return None
         rows = (one.reshape(-1, one.shape[-1]) for one in (before, after))
         arrays = self._readable(*rows, lost)

@@ -30,14 +30,13 @@ class PlaneMotion(Motion):
     """
 
     def __init__(self, layout: Layout, rates: Rates) -> None:
-        super().__init__(States(layout.places), rates)
+        super().__init__(States(layout.rows * layout.columns), rates)
         self.layout, side = layout, math.isqrt(len(rates.moves))
         self.reach, self.inside = side // 2, None
         self.kernel = (1 - rates.jump - rates.leave) * rates.moves.view(1, 1, side, side)
-        self.even = self.kernel.new_tensor(1 / (layout.rows * layout.columns))
         if layout.inside is not None:
             self.inside = layout.inside.to(self.kernel)
-            self.even = (self.inside / self.inside.sum()).flatten()
+            self.each = (self.inside / self.inside.sum()).flatten()
 
     def moved(self, belief: Tensor) -> Tensor:
         on, off = self._split(belief)
@@ -45,7 +44,7 @@ class PlaneMotion(Motion):
         goes = (goes if self.inside is None else goes * self.inside).flatten(1)
         total = on.sum((1, 2))[:, None]
         lost = self.kernel.sum() * total - goes.sum(1, keepdim=True)
-        anywhere = (self.rates.jump * total + self.rates.enter * off) * self.even
+        anywhere = (self.rates.jump * total + self.rates.enter * off) * self.each
         off = (1 - self.rates.enter) * off + self.rates.leave * total + lost
         return torch.cat([goes + anywhere, off], 1).view_as(belief)
 
@@ -53,14 +52,9 @@ class PlaneMotion(Motion):
         on, off = self._split(message)
         _, jump, leave, enter = self.rates
         goes = F.conv2d(self._bordered(on, off), self.kernel)[:, 0].flatten(1)
-        anywhere = (on.flatten(1) * self.even).sum(1, keepdim=True)
+        anywhere = (on.flatten(1) * self.each).sum(1, keepdim=True)
         back = goes + jump * anywhere + leave * off
         return torch.cat([back, enter * anywhere + (1 - enter) * off], 1).view_as(message)
-
-    def anywhere(self) -> Tensor:
-        _, _, leave, enter = self.rates
-        off = (leave / (leave + enter).clamp(min=MIN_PROBABILITY)).clamp(max=0.5)
-        return torch.cat([((1 - off) * self.even).expand(self.layout.rows * self.layout.columns), off[None]])
 
     def counts(self, before: Tensor, after: Tensor) -> Counts:
         (on, off), (later, absent) = self._split(before), self._split(after)
@@ -69,7 +63,7 @@ class PlaneMotion(Motion):
         _, jump, leave, enter = self.rates
         around = self._bordered(later, absent).transpose(0, 1)
         pairs = self.kernel[0] * F.conv2d(around, on[:, None], groups=len(on))[0]  # (B, 2 V + 1, 2 V + 1)
-        total, mean = on.sum((1, 2))[:, None], (later.flatten(1) * self.even).sum(1, keepdim=True)
+        total, mean = on.sum((1, 2))[:, None], (later.flatten(1) * self.each).sum(1, keepdim=True)
         rest = [jump * total * mean, leave * total * absent, enter * off * mean, (1 - enter) * off * absent]
         each = torch.cat([pairs.flatten(1), *rest], 1)
         each = (each / each.sum(1, keepdim=True).clamp(min=MIN_PROBABILITY)).sum(0)

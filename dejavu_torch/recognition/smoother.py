@@ -15,7 +15,6 @@ from typing_extensions import Self
 from dejavu_torch.places.layout import Layout
 from dejavu_torch.places.states import Link, States
 from dejavu_torch.recognition.engine import (
-    NUMBERS_AT_ONCE,
     Block,
     Counts,
     Evidence,
@@ -23,9 +22,9 @@ from dejavu_torch.recognition.engine import (
     FittedPart,
     Motion,
     Rates,
-    folded,
     learn,
     nats,
+    size_of,
     sweep,
 )
 from dejavu_torch.recognition.evidence import (
@@ -187,7 +186,7 @@ class PlaceSmoother(SequenceModel):
         Shape: (Q,N), (Q,K) or None -> (Q,N+1), off the map last; rows add up to 1.
         """
         blocks = self.blocks(self.drive(scores, descriptors), route_starts)
-        parts = [folded(block.posterior, scores.shape[1]) for block in blocks]
+        parts = [block.motion.folded(block.posterior) for block in blocks]
         return torch.cat(parts[::-1]) if parts else scores.new_zeros(0, scores.shape[1] + 1)
 
     def log_evidence(
@@ -272,10 +271,11 @@ class PlaceSmoother(SequenceModel):
         queries, and the belief before each of the others.
 
         Args:
-            size: queries of a block; None is about the root of their number, or more if they are small.
+            size: queries of a block; None is as in `size_of`.
         """
         for block in blocks_together([(self, drive)], route_starts, size):
-            yield Block(block.first, *(part[0] for part in block[1:]))
+            first, before, likelihood, after, log, motion = block
+            yield Block(first, before[0], likelihood[0], after[0], log[0], motion)
 
     @torch.no_grad()
     def fit(
@@ -424,8 +424,6 @@ def blocks_together(
     moves, and the same links."""
     means = [drive.means for _, drive in drives]
     queries, places = len(drives[0][1].spacing.still), len(means[0])
-    if size is None:
-        size = max(1, math.isqrt(queries), NUMBERS_AT_ONCE // (len(drives) * (2 * places + 1)))
     rates = (smoother.rates(mean) for (smoother, _), mean in zip(drives, means, strict=True))
     first = drives[0][0]
     motion = first.motion(
@@ -438,7 +436,7 @@ def blocks_together(
         return motion.wide(logs.exp(), 1.0)
 
     still = torch.stack([drive.spacing.still for _, drive in drives]).to(means[0].device)
-    yield from sweep(motion, likelihood, queries, still, size)
+    yield from sweep(motion, likelihood, queries, still, size or size_of(motion, still))
 
 
 def first_that_explains(fits: Iterator[Fit], moving: float, different: float) -> Fit:

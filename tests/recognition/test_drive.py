@@ -95,7 +95,7 @@ def test_what_is_no_drive_is_answered_by_single_queries():
 def test_blocks_give_what_the_whole_gives(drives, monkeypatch):
     scores = shown(80, range(70), clear=2.5 if drives else 0.0)
     whole = localized(scores, PlaceSmoother(), k=2, platt=PLATT)
-    monkeypatch.setattr(smoothing, "NUMBERS_AT_ONCE", 1)
+    monkeypatch.setattr(engine, "NUMBERS_AT_ONCE", 1)
     parts = localized(scores, PlaceSmoother(), k=2, platt=PLATT)
     for name, column in whole.columns.items():
         assert torch.allclose(parts.columns[name], column, atol=1e-5, equal_nan=True)
@@ -163,7 +163,7 @@ def test_drives_are_matched_together_as_each_by_itself():
 @pytest.mark.parametrize("kept", [0, 2**26])
 def test_scores_are_computed_once_if_they_can_be_kept(kept, monkeypatch):
     monkeypatch.setattr(driving, "SCORES_KEPT", kept)
-    monkeypatch.setattr(smoothing, "NUMBERS_AT_ONCE", 2**12)
+    monkeypatch.setattr(engine, "NUMBERS_AT_ONCE", 2**12)
     monkeypatch.setattr(engine, "HELD", 2**12)
     scores, asked = shown(80, [*range(5, 75)]), torch.zeros(70)
 

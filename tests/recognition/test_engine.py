@@ -14,8 +14,9 @@ from test_motion import matrix_of, motion_of, steps_of
 
 from dejavu_torch.places.layout import Layout
 from dejavu_torch.places.states import States
-from dejavu_torch.recognition import motion as motions
+from dejavu_torch.recognition import loops
 from dejavu_torch.recognition.engine import Block, Motion, Rates, normalised, sweep
+from dejavu_torch.recognition.evidence import RankTable, Standardised
 from dejavu_torch.recognition.localizer import Matching, answer
 from dejavu_torch.recognition.motion import AlongRoute
 from dejavu_torch.recognition.scorer import OfRows
@@ -68,7 +69,7 @@ def test_loops_do_as_torch_does(steps, queries, seed):
     still = torch.rand(2, queries, generator=draw) < 0.3
     starts = torch.rand(2, size, generator=draw), torch.rand(2, size, generator=draw)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(motions, "WORTH_COMPILING", 1)
+        patch.setattr(loops, "WORTH_COMPILING", 1)
         for motion, start in ((one, starts[0]), (one, starts[0][0]), (two, starts[0])):
             expected = Motion.ahead(motion, start, likelihood, still)
             for own, other in zip(motion.ahead(start, likelihood, still), expected, strict=True):
@@ -77,14 +78,17 @@ def test_loops_do_as_torch_does(steps, queries, seed):
         literal, last = Motion.behind(one, starts[1], likelihood, still)
         torch.testing.assert_close(normalised(after), normalised(literal), atol=1e-5, rtol=1e-4)
         torch.testing.assert_close(normalised(message), normalised(last), atol=1e-5, rtol=1e-4)
-        block = Block(0, starts[0][:, None].expand_as(likelihood), likelihood, after, still.float())
+        block = Block(0, starts[0][:, None].expand_as(likelihood), likelihood, after, still.float(), one)
         pairs = block.before * likelihood, after
-        found, masses = one.counts(*pairs), one.masses(block)
-        patch.setattr(motions, "WORTH_COMPILING", 2**30)
+        z = 3 * torch.randn(2, queries, steps.places, generator=draw)
+        scores = Standardised(z, still), z.sigmoid(), still.float()
+        tables = RankTable(), RankTable()
+        found, told = one.counts(*pairs), one.told(block, *scores, tables[0])
+        patch.setattr(loops, "WORTH_COMPILING", 2**30)
         for own, other in zip(found, one.counts(*pairs), strict=True):
             torch.testing.assert_close(own, other, atol=1e-5, rtol=1e-4)
-        for own, other in zip(masses, Motion.masses(one, block), strict=True):
-            torch.testing.assert_close(own, other, atol=1e-5, rtol=1e-4)
+        torch.testing.assert_close(told, one.told(block, *scores, tables[1]), atol=1e-5, rtol=1e-4)
+        torch.testing.assert_close(tables[0].counts, tables[1].counts, atol=1e-5, rtol=1e-4)
 
 
 class Stairs(Motion):
@@ -131,7 +135,7 @@ def test_no_loop_replaces_steps_of_ones_own(monkeypatch):
         def moved(self, belief):
             return (belief + super().moved(belief)) / 2
 
-    monkeypatch.setattr(motions, "WORTH_COMPILING", 1)
+    monkeypatch.setattr(loops, "WORTH_COMPILING", 1)
     slower = Slower(States(5, 2), Rates(torch.tensor([0.2, 0.8]), *torch.tensor([0.01, 0.01, 0.1])))
     belief, still = torch.eye(11)[2], torch.zeros(1, dtype=torch.bool)
     before, *_ = slower.ahead(belief, torch.ones(1, 11), still)
@@ -146,7 +150,7 @@ def test_no_images_over_an_area_have_no_answers():
 
 
 def test_gradients_go_through_torch(monkeypatch):
-    monkeypatch.setattr(motions, "WORTH_COMPILING", 1)
+    monkeypatch.setattr(loops, "WORTH_COMPILING", 1)
     moves = torch.tensor([0.2, 0.8], requires_grad=True)
     motion = AlongRoute(States(5, 2), Rates(moves, *torch.tensor([0.01, 0.01, 0.1])))
     seen = torch.rand(4, 11, generator=torch.Generator().manual_seed(0))

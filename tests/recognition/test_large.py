@@ -129,8 +129,8 @@ def test_a_drive_is_fitted_to_no_more_queries_than_it_may():
 def test_scores_of_windows_are_those_that_were_given(monkeypatch):
     scores = shown(300, range(20, 280))
     drive = LargeDrive(by_rows(scores, noise(260, 8)), PlaceSmoother())
-    for first, posterior, own, places in drive:
-        assert torch.allclose(posterior.sum(1), torch.ones(len(posterior)), atol=1e-5)
+    for first, mass, own, places in drive:
+        assert bool((mass >= 0).all() and (mass.sum(1) <= 1 + 1e-5).all() and (mass.amax(1) > 0.1).all())
         assert torch.allclose(own, scores[first : first + len(own)][:, places], atol=0.01)
 
 

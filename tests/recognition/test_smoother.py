@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from reference import Steps, all_paths, forward_backward
 
-from dejavu_torch.recognition.engine import folded, normalised, sweep
+from dejavu_torch.recognition.engine import normalised, sweep
 from dejavu_torch.recognition.motion import AlongRoute
 from dejavu_torch.recognition.smoother import PlaceSmoother, stretches, updated_rates
 
@@ -35,6 +35,12 @@ def evidence(smoother, scores):
     """What the scores say of the places, and which queries are in a stop."""
     drive = smoother.drive(scores)
     return drive.log_likelihood(torch.arange(len(scores))), drive.spacing.still
+
+
+def folded(states):
+    """Of both directions, the mass of the places, and of being off the map."""
+    there, back = states[:, :-1].chunk(2, 1)
+    return torch.cat([there + back.flip(1), states[:, -1:]], 1)
 
 
 def steps_of(smoother, places, starts=(0,)):
@@ -74,7 +80,7 @@ def test_equals_a_literal_loop_in_blocks_of_any_size(smoother, shape, size, two_
     found = smoother.posterior(scores, route_starts=starts)
     blocks = list(smoother.blocks(smoother.drive(scores), starts, size))
     assert smoother.log_evidence(scores, route_starts=starts).item() == pytest.approx(total, abs=1e-9)
-    assert torch.allclose(found, folded(states, scores.shape[1]), atol=1e-9)
+    assert torch.allclose(found, folded(states), atol=1e-9)
     assert torch.allclose(found.sum(1), torch.ones(queries, dtype=torch.float64))
     assert [block.first for block in blocks] == [*range(0, queries, size)][::-1]
     assert torch.allclose(torch.cat([block.posterior for block in blocks[::-1]]), states, atol=1e-9)
@@ -95,7 +101,7 @@ def test_a_stop_moves_nowhere_and_counts_once():
     steps = steps_of(smoother, 2)
     expected, total = forward_backward(steps, log.tolist(), still.tolist())
     states = torch.tensor(expected, dtype=torch.float64)
-    assert torch.allclose(smoother.posterior(scores), folded(states, scores.shape[1]))
+    assert torch.allclose(smoother.posterior(scores), folded(states))
     assert smoother.log_evidence(scores).item() == pytest.approx(total)
     assert torch.equal(smoother.path(scores)[1:23], smoother.path(scores)[1].expand(22))
 
@@ -267,7 +273,7 @@ def test_queries_that_say_nothing_are_as_without_them():
     log[20:25] = 0
     expected, _ = forward_backward(steps_of(smoother, 60), log.tolist(), [False] * 60)
     for one in found:
-        assert torch.allclose(one, folded(torch.tensor(expected), 60), atol=1e-4)
+        assert torch.allclose(one, folded(torch.tensor(expected)), atol=1e-4)
     assert found[0][20:25, :-1].argmax(1).tolist() == [*range(20, 25)]
 
 
@@ -341,9 +347,7 @@ def test_scores_may_be_made_as_they_are_asked_for():
     assert repr(made) == repr(given_)
     assert asked[1:] == [*range(50)]  # after a look at how many places there are
     blocks = made.blocks(made.drive(rows, descriptors), size=7)
-    found = torch.cat(
-        [folded(block.posterior, (block.posterior.shape[1] - 1) // 2) for block in blocks][::-1]
-    )
+    found = torch.cat([block.motion.folded(block.posterior) for block in blocks][::-1])
     assert torch.allclose(found, given_.posterior(scores, descriptors), atol=1e-6)
     assert made.log_likelihood == given_.log_likelihood
     again = repr(made.fit(rows, descriptors))
