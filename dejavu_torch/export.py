@@ -150,8 +150,8 @@ class Graph(nn.Module):
         if self.views > 1:  # by which one is chosen
             frames = (frames.view(-1, self.views, frames.shape[1]) + self.penalties).amin(1)
         if self.sequence is not None:
-            frames, state = self.sequence.step(frames, states[0])
-            after.insert(0, state)
+            frames, state = self.sequence.step(frames, self.sequence.unpacked(states[0]))
+            after.insert(0, self.sequence.packed(state))
         return (frames, *after) if after else frames
 
 
@@ -278,10 +278,11 @@ def _facts(model: DejaVu, sequence: SequenceModel | None, centre: bool, views: V
             precision = model.acceptance().precision
             facts |= {} if precision is None else {"precision": precision}
     else:
-        state = list(sequence.start(places, fixed=True).shape)
+        first = sequence.packed(sequence.start(places, fixed=True))
+        state = list(first.shape)
         facts["inputs"] = {name: [1, *sizes], "state": state}
         facts["outputs"] = {"scores": [1, places], "next_state": state}
-        facts["first_state"] = "nan" if sequence.start(places, fixed=True).isnan().any() else "0"
+        facts["first_state"] = "nan" if first.isnan().any() else "0"
         facts["sequence"] = str(sequence)
         threshold = sequence.threshold_of(model.threshold)
         threshold = sequence.likely if threshold is None else threshold  # without a calibration

@@ -27,6 +27,7 @@ BATCH_NUMBERS = 2**26  # values in a batch of more than one frame: 256 MB
 BATCH_SIZE = 64  # frames read at a time by default
 FRAME_NUMBERS = 2**28  # values in one frame: 1 GB
 
+State: TypeAlias = Any  # of a sequence model between queries: a tensor, or a named tuple of tensors
 Facts: TypeAlias = dict[str, Any]  # what JSON holds, settings and other values of many types, by name
 # T queries in a sequence, all so far in a filter, or all of the drive in a smoother
 Together = int | Literal["filter", "smoother", "sequence"]
@@ -374,13 +375,11 @@ class SequenceModel(nn.Module, ABC):
     lag: int = 0
 
     @abstractmethod
-    def start(self, places: int, fixed: bool = False) -> Tensor:
+    def start(self, places: int, fixed: bool = False) -> State:
         """The state before the first query; `fixed`: in its final shape, as an exported graph needs it."""
 
     @abstractmethod
-    def step(
-        self, scores: Tensor, state: Tensor, route_starts: Sequence[int] = (0,)
-    ) -> tuple[Tensor, Tensor]:
+    def step(self, scores: Tensor, state: State, route_starts: Sequence[int] = (0,)) -> tuple[Tensor, State]:
         """Scores (B,N) of the next B queries, the state, and the first place of each route -> scores (B,N),
         the next state."""
 
@@ -417,15 +416,25 @@ class SequenceModel(nn.Module, ABC):
         probabilities are added up."""
         return self.changed(**{name: value for name, value in settings.items() if name in self.__dict__})
 
-    def finish(self, state: Tensor, route_starts: Sequence[int] = (0,)) -> tuple[Tensor, Tensor]:
+    def packed(self, state: State) -> Tensor:
+        """A state as one tensor, as in an exported graph."""
+        tensor: Tensor = state
+        return tensor
+
+    def unpacked(self, state: Tensor) -> State:
+        """The state that was packed."""
+        return state
+
+    def finish(self, state: State, route_starts: Sequence[int] = (0,)) -> tuple[Tensor, State]:
         """The answers that wait for later queries, at the end of all: -> scores (B,N), the next state."""
         return state.new_zeros(0, state.shape[-1]), state
 
-    def waiting(self, state: Tensor) -> Tensor:
+    def waiting(self, state: State) -> Tensor:
         """Scores (R,N) of the queries that wait for their answers."""
-        return state[:0]
+        none: Tensor = state[:0]
+        return none
 
-    def skipped(self, state: Tensor, queries: int, route_starts: Sequence[int] = (0,)) -> Tensor:
+    def skipped(self, state: State, queries: int, route_starts: Sequence[int] = (0,)) -> State:
         """The state after queries that are left out."""
         return state
 

@@ -29,7 +29,7 @@ def streamed(model, batches):
     """`step` over consecutive batches of scores (B,N)."""
     state = None
     for scores in batches:
-        state = model.start(scores.shape[1]).to(scores) if state is None else state
+        state = model.start(scores.shape[1]) if state is None else state
         found, state = model.step(scores, state)
         yield found
 

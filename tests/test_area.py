@@ -300,7 +300,7 @@ def test_a_filter_learns_the_course_of_a_flight():
     course = model.map.area.place_at(torch.stack([torch.arange(5, 25), torch.arange(0, 40, 2)], 1))
     localizer = model.localizer(model.matching(PlaceFilter()))
     localizer(own[course])
-    learned = localizer.matching.sequence._parts(localizer.states["filter"])[2].moves.view(11, 11)
+    learned = localizer.states["filter"].learned.moves.view(11, 11)
     assert divmod(int(learned.argmax()), 11) == (5 + 1, 5 + 2)  # a row and two columns
     assert 5 < float(learned.sum()) < 20  # early moves are forgotten
 

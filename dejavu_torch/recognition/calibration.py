@@ -13,7 +13,7 @@ from torch import Tensor
 from dejavu_torch.maps.place_map import PlaceMap
 from dejavu_torch.places.layout import ROUTE, Layout
 from dejavu_torch.recognition.engine import normalised
-from dejavu_torch.recognition.filter import PlaceFilter, moments_of
+from dejavu_torch.recognition.filter import FilterState, PlaceFilter, moments_of
 from dejavu_torch.recognition.select import best_candidates, best_match
 from dejavu_torch.recognition.smoother import Drive, PlaceSmoother
 from dejavu_torch.types import InputError, Match, SequenceModel, expect
@@ -272,11 +272,11 @@ def calibrated_by_drive(
     filtered: tuple[list[Tensor], ...] = [], [], []
     tracks, first = (Track(layout), Track(layout)), 0
     filters = [PlaceFilter().over(layout) for _ in tracks]
-    states: list[Tensor] = []
+    states: list[FilterState] = []
     for scores in blocks:
         place = places[first : first + len(scores)].to(scores.device)
         first, known = first + len(scores), place >= 0
-        states = states or [filter.start(scores.shape[1]).to(scores) for filter in filters]
+        states = states or [filter.start(scores.shape[1]) for filter in filters]
         near = scores.scatter(1, layout.around(place.clamp(min=0), 2 * TOLERANCE), math.inf)
         for i, rows in enumerate((scores, torch.where(known[:, None], near, scores))):
             belief, states[i] = filters[i].step(rows, states[i], layout.starts)

@@ -46,6 +46,30 @@ def moments_of(scores: Tensor) -> Moments:
     return Moments(mean, torch.where(varied, variance, 1).sqrt(), varied, valid)
 
 
+class FilterState(NamedTuple):
+    """What a filter knows between queries.
+
+    Attributes:
+        belief: (N+1,), given the queries so far, the off-map probability last; all 0 before the first one.
+        posterior: (N+1,), of the latest answer, which with a lag depends on later queries as well.
+        learned: what the queries so far tell, if the filter learns.
+        waiting: (R,N), scores of the queries that wait for their answers.
+        left_out: after each of these, how many queries were left out.
+    """
+
+    belief: Tensor
+    posterior: Tensor
+    learned: Learned | Followed | None
+    waiting: Tensor
+    left_out: tuple[int, ...] = ()
+
+    def to(self, like: Tensor) -> FilterState:
+        """The same, of the type and on the device of a tensor."""
+        learned = self.learned and type(self.learned)(*(one.to(like) for one in self.learned))
+        belief, posterior, waiting = (one.to(like) for one in (self.belief, self.posterior, self.waiting))
+        return FilterState(belief, posterior, learned, waiting, self.left_out)
+
+
 class PlaceFilter(SequenceModel):
     """The place of the latest query given all queries: the forward algorithm of a hidden Markov model.
 
@@ -74,12 +98,9 @@ class PlaceFilter(SequenceModel):
         L-th before the latest that it has not given yet.
 
     Convention: causal. exp(-score) is at most the probability that the right place is within `within` places.
-        The state is the posterior, the off-map probability last, and all 0 before the first query. A place
-        that nothing covers scores +inf. `moves` to `off_map` are parameters. With a lag, or learning, the
-        state is a matrix of N+1 columns: the posterior of the latest answer; with a lag, the filter's own for
-        this query; what is learned; and the scores of each query that waits for its answer, with the number
-        of frames left out after it. With a lag of all queries but one, the answers are those of
-        forward-backward smoothing.
+        A place that nothing covers scores +inf. `moves` to `off_map` are parameters. The state of `step` is a
+        `FilterState`; in an exported graph it is one tensor, see `packed`. With a lag of all queries but one,
+        the answers are those of forward-backward smoothing.
 
     Source: the topometric filter of Xu, Fischer, Sünderhauf and Milford (RA-L 2021) has an off-map state; the
         motion model and the likelihood are ours.
@@ -137,8 +158,26 @@ class PlaceFilter(SequenceModel):
             sharpness = nn.Parameter(torch.full_like(sharpness.detach(), own))
         return self.changed(layout=layout, move_logits=moves, log_sharpness=sharpness)
 
-    def start(self, places: int, fixed: bool = False) -> Tensor:
-        return self.off_map.new_zeros(self._shape(places))
+    def start(self, places: int, fixed: bool = False) -> FilterState:
+        new = self.off_map.detach().new_zeros
+        kind, moves = self._learned, len(self.move_logits)
+        learned = None if kind is None else kind.unpacked(new(kind.size(places, moves)), places, moves)
+        return FilterState(new(places + 1), new(places + 1), learned, new(0, places))
+
+    def packed(self, state: FilterState) -> Tensor:
+        """The state of a filter without a lag: its belief (N+1,), or, if it learns, that and what is learned
+        in rows (R,N+1)."""
+        if state.learned is None:
+            return state.belief
+        numbers = torch.cat([state.belief, *state.learned])
+        return F.pad(numbers, (0, -len(numbers) % len(state.belief))).view(-1, len(state.belief))
+
+    def unpacked(self, state: Tensor) -> FilterState:
+        """The state that was packed."""
+        places, rows = state.shape[-1] - 1, state.reshape(-1, state.shape[-1])
+        kind, learned = self._learned, rows[1:].flatten()
+        known = None if kind is None else kind.unpacked(learned, places, len(self.move_logits))
+        return FilterState(rows[0], rows[0], known, state.new_zeros(0, places))
 
     def forward(self, scores: Tensor, before: Tensor | None = None) -> Tensor:
         if scores.ndim > 2:
@@ -158,78 +197,56 @@ class PlaceFilter(SequenceModel):
         """
         check_posterior(before, scores.shape[-1])
         state = self.start(scores.shape[-1])
-        if before is not None and state.ndim == 1:
-            state = before
-        elif before is not None:
-            heads = 1 + (self.lag > 0)
-            state = torch.cat([before.expand(heads, -1), state[heads:].to(before)])
+        if before is not None:
+            state = state._replace(belief=before, posterior=before)
         return self._answers(scores, state, last=True)[0]
 
     def step(
-        self, scores: Tensor, state: Tensor, route_starts: Sequence[int] = (0,), last: bool = False
-    ) -> tuple[Tensor, Tensor]:
+        self, scores: Tensor, state: FilterState, route_starts: Sequence[int] = (0,), last: bool = False
+    ) -> tuple[Tensor, FilterState]:
         posteriors, answered, state = self._answers(scores, state, route_starts, last)
         return self.near(posteriors[:, :-1], answered), state
 
-    def finish(self, state: Tensor, route_starts: Sequence[int] = (0,)) -> tuple[Tensor, Tensor]:
+    def finish(self, state: FilterState, route_starts: Sequence[int] = (0,)) -> tuple[Tensor, FilterState]:
         """The answers that wait for later queries, at the end of all: -> scores (B,N), the next state."""
-        return self.step(state.new_zeros(0, state.shape[-1] - 1), state, route_starts, last=True)
+        return self.step(state.waiting[:0], state, route_starts, last=True)
 
-    def skipped(self, state: Tensor, queries: int, route_starts: Sequence[int] = (0,)) -> Tensor:
+    def skipped(self, state: FilterState, queries: int, route_starts: Sequence[int] = (0,)) -> FilterState:
         """The state after queries that are left out: the camera moved once more for each."""
-        _, belief, learned, waiting = self._parts(state)
-        if len(waiting):
-            state = state.clone()
-            state[-1, -1] += queries
-            return state
-        motion = self.motion(belief[:-1], route_starts, learned)
+        belief = state.belief
+        if state.left_out:
+            return state._replace(left_out=(*state.left_out[:-1], state.left_out[-1] + queries))
+        motion = self.motion(belief[:-1], route_starts, state.learned)
         for _ in range(queries if bool(belief.any()) else 0):
             belief = motion.moved(belief)
-        at = int(self.lag > 0)
-        return belief if state.ndim == 1 else torch.cat([state[:at], belief[None], state[at + 1 :]])
+        return state._replace(belief=belief, posterior=state.posterior if self.lag else belief)
 
-    def waiting(self, state: Tensor) -> Tensor:
+    def waiting(self, state: FilterState) -> Tensor:
         """Scores (R,N) of the queries that wait for their answers."""
-        return self._parts(state)[-1][:, :-1]
-
-    def _shape(self, places: int) -> tuple[int, ...]:
-        """Of the state while no query waits."""
-        size = 0 if (kind := self._learned) is None else kind.size(places, len(self.move_logits))
-        rows = 1 + (self.lag > 0) + -(-size // (places + 1))
-        return (rows, places + 1)[not self.lag and kind is None :]
+        return state.waiting
 
     @property
     def _learned(self) -> type[Learned] | type[Followed] | None:
         """The kind of what is learned on the way."""
         return {1: Learned if self.learns else None, 2: Followed}[self.layout.dimensions]
 
-    def _parts(self, state: Tensor) -> tuple[Tensor, Tensor, Learned | Followed | None, Tensor]:
-        """Posterior of the latest answer (N+1,), that of the filter, what is learned, and (R,N+1) queries
-        that wait."""
-        rows, heads = state.reshape(-1, state.shape[-1]), 1 + (self.lag > 0)
-        if (kind := self._learned) is None:
-            return rows[0], rows[heads - 1], None, rows[heads:]
-        places = rows.shape[1] - 1
-        end = self._shape(places)[0]
-        learned = kind.unpacked(rows[heads:end].flatten(), places, len(self.move_logits))
-        return rows[0], rows[heads - 1], learned, rows[end:]
-
     @without_autocast
     def _answers(
-        self, scores: Tensor, state: Tensor, route_starts: Sequence[int] = (0,), last: bool = False
-    ) -> tuple[Tensor, Tensor, Tensor]:
+        self, scores: Tensor, state: FilterState, route_starts: Sequence[int] = (0,), last: bool = False
+    ) -> tuple[Tensor, Tensor, FilterState]:
         """Posteriors (A,N+1) of the queries whose answers are due, or of all, their scores (A,N), and the
         next state."""
         if scores.ndim != 2 or scores.shape[1] < 1 or not scores.is_floating_point():
             raise InputError(f"scores are {tuple(scores.shape)} {scores.dtype}; expected floats (Q,N)")
-        places, shape = scores.shape[1], self._shape(scores.shape[1])
-        if state.shape[-1:] != shape[-1:] or state.ndim != len(shape) or len(state) < shape[0]:
-            raise InputError(f"the posterior is {tuple(state.shape)}; expected {shape} for this map")
-        posterior, belief, learned, waiting = self._parts(state.to(scores))
-        left_out = [0] * (len(waiting) + len(scores))
-        if len(waiting):
-            scores, left = torch.cat([waiting[:, :-1], scores]), waiting[:, -1]
-            left_out[: len(left)] = map(int, left.tolist()) if is_plain(left) else left_out[: len(left)]
+        places = scores.shape[1]
+        if not isinstance(state, FilterState):
+            raise InputError(f"the state is a {type(state).__name__}; expected that of `start` or of a step")
+        if state.belief.shape != (places + 1,):
+            shapes = f"the posterior is {tuple(state.belief.shape)}; expected {(places + 1,)}"
+            raise InputError(f"{shapes} for this map")
+        belief, posterior, learned, waiting, left = state.to(scores)
+        left_out = (*left, *[0] * len(scores))
+        scores = torch.cat([waiting, scores]) if len(waiting) else scores
         moments, motion = moments_of(scores), self.motion(scores, route_starts, learned)
         likelihoods = self.likelihoods(scores, moments) if learned is None else scores  # else in turn
         posteriors, due = [], len(scores) if last else max(0, len(scores) - self.lag)
@@ -254,17 +271,11 @@ class PlaceFilter(SequenceModel):
             for _ in range(left_out[t]):
                 belief = motion.moved(belief)
         answers = torch.stack(posteriors) if posteriors else scores.new_zeros(0, places + 1)
-        if state.ndim == 1:
-            return answers, scores, belief
-        rest = F.pad(scores[due:], (0, 1))
-        if any(left_out[due:]):
-            rest[:, -1] = rest.new_tensor(left_out[due:])
-        parts = [posterior[None], *([belief[None]] if self.lag else [])]
-        if learned is not None:
-            numbers = torch.cat(learned)
-            parts.append(F.pad(numbers, (0, -len(numbers) % (places + 1))).view(-1, places + 1))
-        parts.append(rest)
-        return answers, scores[:due], torch.cat(parts)
+        return (
+            answers,
+            scores[:due],
+            FilterState(belief, posterior, learned, scores[due:], left_out[due:]),
+        )
 
     def _message(self, motion: Motion, likelihoods: Tensor, left_out: Sequence[int]) -> Tensor:
         """What the queries after the first one say of it, (R,N+1) -> (N+1,)."""

@@ -18,6 +18,7 @@ from dejavu_torch.places.layout import ROUTE, Layout
 from dejavu_torch.recognition.calibration import TOLERANCE, Platt, Track, best_pair, confidence_of
 from dejavu_torch.recognition.calibration import confidence as confidence_of_pair
 from dejavu_torch.recognition.drive import DriveQuery, answer_drives, first_of
+from dejavu_torch.recognition.filter import FilterState
 from dejavu_torch.recognition.scorer import OfMap, Scorer, of_stored
 from dejavu_torch.recognition.search import Search, Searcher
 from dejavu_torch.recognition.select import Acceptance, accept, best_candidates, best_match
@@ -31,7 +32,7 @@ from dejavu_torch.recognition.taken import (
 )
 from dejavu_torch.recognition.views import Views
 from dejavu_torch.text import with_progress
-from dejavu_torch.types import Match, SequenceModel, Together, expect
+from dejavu_torch.types import Match, SequenceModel, State, Together, expect
 
 CACHED = 2**20  # scores processed at a time: they stay in the cache
 
@@ -105,7 +106,7 @@ class Localizer:
         self.models: dict[Together, SequenceModel] = {**matching.also}
         if sequence is not None:
             self.models[self.own] = sequence
-        self.states: dict[Together, Tensor] = {}  # of the models; empty before the first query
+        self.states: dict[Together, State] = {}  # of the models; empty before the first query
         self.route_starts = layout.starts
 
     def __call__(self, descriptors: Tensor, progress: bool = False) -> Match:
@@ -206,7 +207,8 @@ class Localizer:
         places = max(1, self.layout.places)
         if self.matching.sequence is None or not self.matching.sequence.lag or not self.states:
             return self.match(torch.zeros(0, places))
-        match = self._in_sequence(self.states[self.own].new_zeros(0, places), last=True)
+        owed = self.matching.sequence.waiting(self.states[self.own])
+        match = self._in_sequence(owed[:0], last=True)
         return self._doubted(match, torch.tensor(self.running.odds)) if len(self.alone) else match
 
     def _doubted(self, match: Match, odds: Tensor) -> Match:
@@ -223,8 +225,8 @@ class Localizer:
     @property
     def posterior(self) -> Tensor | None:
         """(N+1,) of a filter for the latest answer; None without a filter, or before the first query."""
-        state = self.states.get("filter")
-        return state if state is None or state.ndim == 1 else state[0]
+        state: FilterState | None = self.states.get("filter")
+        return state if state is None else state.posterior
 
     def _alone(self, scores: Tensor, places: Tensor | None = None) -> Match:
         """Match single images by their scores, of all places or of those that are named."""
@@ -236,7 +238,7 @@ class Localizer:
         )
 
     def _in_sequence(self, scores: Tensor, stored: Tensor | None = None, last: bool = False) -> Match:
-        states = self.states or {T: m.start(scores.shape[1]).to(scores) for T, m in self.models.items()}
+        states = self.states or {T: m.start(scores.shape[1]) for T, m in self.models.items()}
         steps = {T: m.step(scores, states[T], self.route_starts) for T, m in self.models.items()}
         sequence, found = self.matching.sequence, {T: final for T, (final, _) in steps.items()}
         if sequence is not None and sequence.lag:
