@@ -8,6 +8,7 @@ from typing import Any
 from benchmarks import (
     alike,
     areas,
+    chosen,
     chunks,
     cluster,
     cross,
@@ -44,6 +45,7 @@ BENCHES: dict[str, Any] = {  # each returns the lines to print
     "files": files.run_files,
     "order": order.run_order,
     "areas": areas.run_areas,
+    "chosen": chosen.run_chosen,
     "headings": headings.run_headings,
     "terrain": terrain.run_terrain,
     "matcher": matcher.run_matcher,

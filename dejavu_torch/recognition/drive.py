@@ -14,6 +14,7 @@ from torch import Tensor
 from dejavu_torch.memory import in_one_thread
 from dejavu_torch.places.layout import ROUTE
 from dejavu_torch.places.states import States
+from dejavu_torch.recognition import chosen
 from dejavu_torch.recognition.calibration import Platt, best_pair, confidence, confidence_of
 from dejavu_torch.recognition.engine import Motion
 from dejavu_torch.recognition.evidence import Spacing, spacing_of
@@ -34,7 +35,6 @@ from dejavu_torch.recognition.taken import ALONE, FEW, SURER, UPPER, doubted, si
 from dejavu_torch.text import progress_of
 from dejavu_torch.types import Match, expect
 
-DOUBT = 0.1  # nats for each deviation by which an answer's own score is worse than is usual in the drive
 SCORES_KEPT = 2**26  # scores of drives that are smoothed together, up to which they are computed once
 NORMAL = 1.4826  # standard deviations of a Gaussian over its median absolute deviation
 
@@ -265,7 +265,7 @@ def doubt(own: Tensor) -> Tensor:
     median = known.median()
     deviation = NORMAL * (known - median).abs().median()
     worse = (own - median) / deviation.clamp(min=1e-12)
-    return DOUBT * worse.nan_to_num(0, 0, 0).clamp(0, 1 / DOUBT**2)
+    return chosen.DOUBT * worse.nan_to_num(0, 0, 0).clamp(0, 1 / chosen.DOUBT**2)
 
 
 def first_of(column: Tensor, k: int) -> Tensor:

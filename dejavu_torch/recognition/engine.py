@@ -17,11 +17,10 @@ from torch import Tensor
 
 from dejavu_torch.places.rectangles import window_sums
 from dejavu_torch.places.states import States
+from dejavu_torch.recognition import chosen
 from dejavu_torch.recognition.evidence import RankTable, Standardised
 
 MIN_PROBABILITY = 1e-30  # a probability of 0, with a finite gradient
-ROUNDS = 5  # of expectation-maximisation
-RADIUS = 5  # places around a right one whose scores are not counted as wrong
 NUMBERS_AT_ONCE = 2**20  # numbers of a block of queries and states, which stays in the cache
 HELD = 2**25  # of all of them, up to which they are kept for the way back
 
@@ -114,7 +113,7 @@ class Motion(ABC):
         """
         own, others = (self.folded(one)[..., :-1] for one in (block.posterior, normalised(block.others)))
         shares = shares[..., None]
-        table.add(std.z, std.only(-shares * self.near(own, RADIUS), 0))
+        table.add(std.z, std.only(-shares * self.near(own, chosen.RADIUS), 0))
         others = others * shares
         return torch.stack([(others * std.only(normal, 0)).sum(), others.sum()])
 
@@ -349,7 +348,7 @@ def learn(
     """
     separation, least, tempering = evidence
     table, z = ranks, samples[0].std.z
-    for _ in range(ROUNDS):
+    for _ in range(chosen.ROUNDS):
         values, table, sums, counts = table.values, RankTable(ranks.counts), z.new_zeros(2), []
         for sample in samples:
             motion, later = sample.over(rates), None

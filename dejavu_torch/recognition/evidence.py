@@ -12,15 +12,11 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from dejavu_torch.maps.compiling import floats_of
-from dejavu_torch.recognition import loops
+from dejavu_torch.recognition import chosen, loops
 
 LOWEST, HIGHEST, PER_DEVIATION = -8, 40, 64  # standard deviations of a rank table, and entries for each
 MIN_SHARE = 1e-30  # of wrong scores, for a finite normal score
-SMALLEST = 0.05  # autocorrelation at which the sum over lags ends
-DETRENDED = 25  # queries to each side whose mean is a trend
 COLUMNS = 256  # of descriptors that are transformed at a time
-UNCHANGED = 0.05  # of a typical step: the queries of a stop differ less than that from its first
-STOP = 20  # queries of a stop; in a shorter one, as where frames repeat in the dark, the camera may move
 
 
 class Spacing(NamedTuple):
@@ -44,8 +40,8 @@ def spacing_of(queries: Tensor) -> Spacing:
     same = unchanged(queries)
     length = run_lengths(same)
     moving = queries[~same]
-    detrended = correlation_time(moving, lambda part: part - local_mean(part, DETRENDED))
-    return Spacing(1 / length, same & (length > STOP), correlation_time(moving), detrended)
+    detrended = correlation_time(moving, lambda part: part - local_mean(part, chosen.DETRENDED))
+    return Spacing(1 / length, same & (length > chosen.STOP), correlation_time(moving), detrended)
 
 
 def unchanged(queries: Tensor) -> Tensor:
@@ -54,8 +50,8 @@ def unchanged(queries: Tensor) -> Tensor:
     steps = (queries[1:] - queries[:-1]).norm(dim=1)
     moving = steps[steps > 0].sort().values
     if len(moving):  # a stop may be most of the drive
-        moving = moving[moving > UNCHANGED * moving[len(moving) * 9 // 10]]
-    least = UNCHANGED * float(moving.median()) if len(moving) else 0.0
+        moving = moving[moving > chosen.UNCHANGED * moving[len(moving) * 9 // 10]]
+    least = chosen.UNCHANGED * float(moving.median()) if len(moving) else 0.0
     first = 0
     for t in ((steps <= least).nonzero()[:, 0] + 1).tolist():
         if not same[t - 1]:
@@ -98,7 +94,7 @@ def correlation_time(queries: Tensor, change: Callable[[Tensor], Tensor] = Tenso
         return 1.0
     lags = torch.fft.irfft(power, n=2 * count)[:count] / torch.arange(count, 0, -1, device=power.device)
     lags = lags / lags[0]
-    small = (lags < SMALLEST).nonzero()
+    small = (lags < chosen.SMALLEST).nonzero()
     last = int(small[0]) if len(small) else max(1, count // 2)  # longer lags have few pairs
     return 1 + 2 * float(lags[1:last].sum())
 

@@ -14,12 +14,12 @@ from torch import Tensor, nn
 
 from dejavu_torch.memory import check_room
 from dejavu_torch.places.layout import Layout
+from dejavu_torch.recognition import chosen
 from dejavu_torch.recognition.engine import Counts, Evidence, Fit, FittedPart, Rates, explained, learn, nats
 from dejavu_torch.recognition.evidence import RankTable, Spacing, place_means, standardised
 from dejavu_torch.recognition.motion import logits
 from dejavu_torch.recognition.plane import PlaneMotion, rings
 from dejavu_torch.recognition.smoother import (
-    MOVE_SHARE,
     PlaceSmoother,
     Rows,
     first_that_explains,
@@ -27,10 +27,6 @@ from dejavu_torch.recognition.smoother import (
 )
 from dejavu_torch.recognition.taken import moves_along
 
-# of which the fit starts: among so many windows a right one has to stand out more than along a route
-SEPARATION, LEAST_SEPARATION = 3.0, 1.0  # standard deviations of scores
-SPREADS = 2.0, 0.7, 4.0  # windows that a step goes in each direction, and where that explains little
-FITTED = 300  # queries in a row, from the middle, that a smoother is fitted to
 BYTES = 45  # of memory for each query and window
 
 
@@ -58,27 +54,27 @@ def place_flight(
     ranks.add(std.z, std.only((weight * std.speaks)[:, None].expand_as(std.z), 0))
     tempering = tempering_of(spacing)
     smoother = smoother.forgetful().changed(correlation=spacing.correlation, tempering=tempering)
-    reach, first = len(smoother.move_logits) - 1, max(0, (queries - FITTED) // 2)
-    part = slice(first, first + FITTED)
+    reach, first = len(smoother.move_logits) - 1, max(0, (queries - chosen.FLIGHT_FITTED) // 2)
+    part = slice(first, first + chosen.FLIGHT_FITTED)
     some, own = std.map(lambda column: column[part]), weight[part]
     away, over = torch.arange(-reach, reach + 1).square(), partial(PlaneMotion, layout)
     sample, _, *rare = FittedPart(some, own, spacing.still[part], over), *smoother.rates(own)
 
     def fitted(spread: float) -> Fit:
         kernel = torch.exp(-(away[:, None] + away) / (2 * spread**2)).flatten()
-        prior = MOVE_SHARE * len(own) * kernel / kernel.sum()
+        prior = chosen.MOVE_SHARE * len(own) * kernel / kernel.sum()
 
         def again(counts: Counts) -> Rates:
             moves = counts.moves + prior
             return Rates(moves / moves.sum(), *rare)  # jumps are not learned
 
-        given = SEPARATION, LEAST_SEPARATION, tempering
+        given = chosen.FLIGHT_SEPARATION, chosen.LEAST_FLIGHT_SEPARATION, tempering
         rates, separation, values = learn([sample], ranks, Rates(kernel / kernel.sum(), *rare), given, again)
         (log,) = nats([sample], Evidence(values, separation, tempering), rates)
         return Fit(rates, separation, values, log, log)
 
     moving = float((~sample.still).sum())
-    rates, separation, values, *_ = first_that_explains(map(fitted, SPREADS), moving, float(own.sum()))
+    rates, separation, values, *_ = first_that_explains(map(fitted, chosen.SPREADS), moving, float(own.sum()))
     every, motion = FittedPart(std, weight, spacing.still, over), over(rates)
     mass, log = scores.new_empty(queries, layout.places), 0.0
     for block in explained(every, Evidence(values, separation, tempering), motion):

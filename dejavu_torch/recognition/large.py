@@ -12,6 +12,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from dejavu_torch.recognition import chosen
 from dejavu_torch.recognition.engine import Evidence, FittedPart, explained
 from dejavu_torch.recognition.evidence import (
     MIN_SHARE,
@@ -21,12 +22,6 @@ from dejavu_torch.recognition.evidence import (
 )
 from dejavu_torch.recognition.scorer import Scorer
 from dejavu_torch.recognition.smoother import (
-    CORRELATED,
-    FEWEST_FITTED,
-    FITTED,
-    SAMPLED,
-    STRETCH,
-    STRETCHES,
     PlaceSmoother,
 )
 from dejavu_torch.text import progress_of
@@ -43,7 +38,7 @@ TILE = 2**22  # numbers at a time
 
 def is_large(queries: int, places: int) -> bool:
     """Whether a drive goes coarse to fine."""
-    return queries > FEWEST_FITTED and (places > LARGE_MAP or queries * places > LARGE)
+    return queries > chosen.FEWEST_FITTED and (places > LARGE_MAP or queries * places > LARGE)
 
 
 class Window(NamedTuple):
@@ -217,12 +212,13 @@ class LargeDrive:
 
     def _fitted(self) -> dict[int, int]:
         """The windows that are fitted to, and how many of their queries."""
-        length, windows = max(STRETCH, math.ceil(CORRELATED * self.spacing.correlation)), self.windows
-        count = max(1, min(STRETCHES, FITTED // length, len(windows)))
-        chosen = torch.linspace(0, len(windows) - 1, count).round().int().tolist()
-        most = [max(FEWEST_FITTED, SAMPLED // (count * max(1, len(windows[i].places)))) for i in chosen]
-        lengths = [min(FITTED // count, windows[i].last - windows[i].first) for i in chosen]
-        return {i: min(pair) for i, *pair in zip(chosen, most, lengths, strict=True)}
+        length, windows = math.ceil(chosen.CORRELATED * self.spacing.correlation), self.windows
+        count = max(1, min(chosen.STRETCHES, chosen.FITTED // max(chosen.STRETCH, length), len(windows)))
+        some = torch.linspace(0, len(windows) - 1, count).round().int().tolist()
+        share = chosen.SAMPLED // count
+        most = [max(chosen.FEWEST_FITTED, share // max(1, len(windows[i].places))) for i in some]
+        lengths = [min(chosen.FITTED // count, windows[i].last - windows[i].first) for i in some]
+        return {i: min(pair) for i, *pair in zip(some, most, lengths, strict=True)}
 
     def _fitted_by(self, ranks: RankTable) -> PlaceSmoother:
         samples = []

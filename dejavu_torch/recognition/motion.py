@@ -12,8 +12,8 @@ from torch import Tensor
 
 from dejavu_torch.maps.compiling import Floats, Kernel, floats_of
 from dejavu_torch.places.states import States
-from dejavu_torch.recognition import loops
-from dejavu_torch.recognition.engine import MIN_PROBABILITY, RADIUS, Block, Counts, Motion, Rates
+from dejavu_torch.recognition import chosen, loops
+from dejavu_torch.recognition.engine import MIN_PROBABILITY, Block, Counts, Motion, Rates
 from dejavu_torch.recognition.evidence import LOWEST, PER_DEVIATION, RankTable, Standardised
 from dejavu_torch.recognition.loops import Route
 from dejavu_torch.types import InputError
@@ -145,7 +145,7 @@ class AlongRoute(Motion):
             found.append(floats_of(shares.flatten()))
             if all(one is not None for one in found) and (kernel := loops.told()) is not None:
                 sums = torch.zeros(2, dtype=torch.float64)
-                binned = LOWEST, PER_DEVIATION, RADIUS
+                binned = LOWEST, PER_DEVIATION, chosen.RADIUS
                 kernel((*found[:3],), (*found[3:],), binned, table.counts.numpy(), sums.numpy())
                 return sums.to(normal)
         return super().told(block, std, normal, shares, table)

@@ -14,6 +14,7 @@ from typing_extensions import Self
 
 from dejavu_torch.places.layout import Layout
 from dejavu_torch.places.states import Link, States
+from dejavu_torch.recognition import chosen
 from dejavu_torch.recognition.engine import (
     Block,
     Counts,
@@ -40,23 +41,6 @@ from dejavu_torch.recognition.motion import AlongRoute, checked_rates, logits
 from dejavu_torch.recognition.taken import Singly, moves_along
 from dejavu_torch.types import Facts, InputError, SequenceModel, expect
 
-MOVES = (0.2, 0.5, 0.2, 0.05, 0.02, 0.015, 0.015)
-SLOW = (0.67, 0.25, 0.05, 0.01, 0.01, 0.005, 0.005)  # of which EM starts if that at one place a query fails
-FAST = (0.05, 0.1, 0.2, 0.3, 0.2, 0.1, 0.05)
-RATES = 0.001, 0.001, 0.01  # jump, leave, enter
-MOVE_SHARE = 0.1  # of the queries: the weight of the prior of the moves
-RATE_COUNTS, ENTER_COUNTS = 200.0, 50.0  # steps that the priors of jump and leave, and of enter, count as
-SHARPENED = 0.6  # tau' = SHARPENED tau
-MIN_SEPARATION = 0.3
-# separation, and tau over tau of detrended queries, above which slow changes, as of a train that waits,
-# do not make a query count less
-SURE, SLOW_CHANGES = 2.5, 7.0
-FITTED, STRETCH, STRETCHES = 1000, 100, 10  # queries that are fitted to at most, in a stretch, and stretches
-FEWEST_FITTED, SAMPLED = 20, 2**21  # queries that are fitted to at least, and their scores at most otherwise
-CORRELATED = 4  # correlation times in a stretch, at least
-# nats above being off the map by which another speed is taken, in all and per query, and times as many as at
-# one place a query
-OTHER_SPEED, PER_QUERY, CLEARLY = 30.0, 0.1, 5.0
 WHOLE = "a smoother has to know the whole drive; expected a PlaceFilter, or a SequenceMatcher"
 
 Rows = Callable[[Tensor], Tensor]  # numbers of queries (B,) -> their scores (B,N)
@@ -111,7 +95,7 @@ class PlaceSmoother(SequenceModel):
 
     def __init__(
         self,
-        moves: Sequence[float] = MOVES,
+        moves: Sequence[float] = chosen.MOVES,
         jump: float = 0.001,
         leave: float = 0.001,
         enter: float = 0.01,
@@ -332,11 +316,12 @@ class PlaceSmoother(SequenceModel):
         like = self.forgetful().changed(correlation=spacing.correlation, tempering=tempering_of(spacing))
         moving = float(sum((~sample.still).sum() for sample in samples))
         different = float(sum(sample.weight.sum() for sample in samples))
-        others = (SLOW, FAST) if self.prior == MOVES else ()
+        others = (chosen.SLOW, chosen.FAST) if self.prior == chosen.MOVES else ()
         fits = (like._fitted(samples, ranks, start, moving) for start in (self.prior, *others))
         best = first_that_explains(fits, moving, different)
         nats_per_query = like.tempering * best.held / max(1.0, different)
-        slow = best.separation >= SURE and spacing.correlation >= SLOW_CHANGES * spacing.detrended
+        slow = spacing.correlation >= chosen.SLOW_CHANGES * spacing.detrended
+        slow &= best.separation >= chosen.SURE
         jump, leave, enter = map(float, best.rates[1:])
         learned = {
             "move_logits": logits(*best.rates.moves.tolist()),
@@ -361,8 +346,8 @@ class PlaceSmoother(SequenceModel):
         """Expectation-maximisation from a start of the moves, which is their prior; `moved` queries move."""
         prior = samples[0].std.z.new_tensor(start)
         rare = [prior.new_tensor(rate) for rate in self.rate_prior]
-        again = partial(updated_rates, prior=prior * (MOVE_SHARE * moved), rates=self.rate_prior)
-        evidence = self.first_separation, MIN_SEPARATION, self.tempering
+        again = partial(updated_rates, prior=prior * (chosen.MOVE_SHARE * moved), rates=self.rate_prior)
+        evidence = self.first_separation, chosen.MIN_SEPARATION, self.tempering
         rates, separation, values = learn(samples, ranks, Rates(prior, *rare), evidence, again)
         found = Evidence(values, separation, self.tempering)
         log, held = nats(samples, found, rates, rates._replace(jump=rare[0], leave=rare[1]))
@@ -443,10 +428,11 @@ def first_that_explains(fits: Iterator[Fit], moving: float, different: float) ->
     """What was found from the first start, or, if that explains little of the queries that are moving, from
     another speed, if this explains far more of those that are different."""
     first = next(fits)
-    if first.log >= max(OTHER_SPEED, PER_QUERY * moving):
+    if first.log >= max(chosen.OTHER_SPEED, chosen.PER_QUERY * moving):
         return first
     other = max(fits, key=lambda one: one.log, default=first)
-    return other if other.log >= max(OTHER_SPEED, PER_QUERY * different, CLEARLY * first.log) else first
+    least = max(chosen.OTHER_SPEED, chosen.PER_QUERY * different, chosen.CLEARLY * first.log)
+    return other if other.log >= least else first
 
 
 def rows_of(scores: Tensor) -> Rows:
@@ -471,23 +457,23 @@ def check_descriptors(descriptors: Tensor | None) -> Tensor:
     return descriptors
 
 
-def updated_rates(counts: Counts, prior: Tensor, rates: Sequence[float] = RATES) -> Rates:
+def updated_rates(counts: Counts, prior: Tensor, rates: Sequence[float] = chosen.RATES) -> Rates:
     """The M-step: counts with those of the priors, of moves (V+1,), and of jump, leave and enter."""
-    moves, on = counts.moves + prior, counts.moves.sum() + counts.jump + counts.leave + RATE_COUNTS
+    moves, on = counts.moves + prior, counts.moves.sum() + counts.jump + counts.leave + chosen.RATE_COUNTS
     jump, leave, enter = rates
     return Rates(
         moves / moves.sum(),
-        (counts.jump + RATE_COUNTS * jump) / on,
-        (counts.leave + RATE_COUNTS * leave) / on,
-        (counts.enter + ENTER_COUNTS * enter) / (counts.enter + counts.absent + ENTER_COUNTS),
+        (counts.jump + chosen.RATE_COUNTS * jump) / on,
+        (counts.leave + chosen.RATE_COUNTS * leave) / on,
+        (counts.enter + chosen.ENTER_COUNTS * enter) / (counts.enter + counts.absent + chosen.ENTER_COUNTS),
     )
 
 
 def stretches(queries: int, correlation: float, places: int = 1, repeated: float = 1.0) -> Tensor:
     """Numbers of queries in evenly spaced stretches, (n,L); of few queries on a large map."""
-    used = min(queries, FITTED, max(FEWEST_FITTED, SAMPLED // places))
-    length = math.ceil(repeated * max(STRETCH, CORRELATED * correlation))
-    n = max(1, min(STRETCHES, used // length))
+    used = min(queries, chosen.FITTED, max(chosen.FEWEST_FITTED, chosen.SAMPLED // places))
+    length = math.ceil(repeated * max(chosen.STRETCH, chosen.CORRELATED * correlation))
+    n = max(1, min(chosen.STRETCHES, used // length))
     length = used // n
     first = torch.linspace(0, queries - length, n).round().long()
     return first[:, None] + torch.arange(length)
@@ -495,7 +481,7 @@ def stretches(queries: int, correlation: float, places: int = 1, repeated: float
 
 def tempering_of(spacing: Spacing) -> float:
     """tau', for how many consecutive queries count as one."""
-    return max(1.0, SHARPENED * spacing.correlation)
+    return max(1.0, chosen.SHARPENED * spacing.correlation)
 
 
 def check_scores(scores: Tensor, descriptors: Tensor | None = None) -> Tensor:

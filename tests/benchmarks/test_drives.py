@@ -10,11 +10,12 @@ import torch
 from command_line import benchmark
 from torch.nn.functional import normalize
 
-from benchmarks import cross, drives, large_drives, storage_drives, tables
+from benchmarks import chosen, cross, drives, large_drives, storage_drives, tables
 from benchmarks.drives import AS_IT_WAS, ELSEWHERE, HALF, NO_OTHER, bench_drives, drives_of
 from benchmarks.storage_drives import ANSWERS, Asked, bench_storage_drives, both_sides, drive_table
 from benchmarks.trainings import Route
 from dejavu_torch.data.ground_truth import as_ground_truth
+from dejavu_torch.recognition import chosen as constants
 from dejavu_torch.recognition.evidence import place_means, standardised
 
 PLACES, NUMBERS = 120, 24
@@ -149,3 +150,19 @@ def test_what_shares_ground_is_no_other_route():
     assert cross.related(board, "laps") == cross.OTHER
     assert cross.related(board._replace(shows=("road, first half",)), "road, second half") == cross.REPEATED
     assert cross.related(board._replace(shows=("railway, first half",)), "railway, second half") == cross.KIND
+
+
+def test_other_constants_are_tried_and_put_back(tmp_path, monkeypatch, capsys):
+    for name, features in {"a": walk(0), "b": walk(1, 1.0), "c": walk(2, 1.0, route=5)}.items():
+        np.save(tmp_path / f"{name}.npy", features.numpy())
+    route = Route("{data}/a.npy", "{data}/b.npy", 2, "0")
+    monkeypatch.setattr(chosen, "ROUTES", {"walk": (route, "{data}/c.npy")})
+    monkeypatch.setattr(chosen, "HALVED", ("SHARPENED", "ROUNDS"))
+    before = vars(constants).copy()
+    benchmark("chosen", tmp_path, "--constants", "ROUNDS", "FAST", "--out", tmp_path / "out")
+    rows = json.loads((tmp_path / "out" / "bench.json").read_text())["rows"]
+    assert [row["contender"] for row in rows] == ["as it is", "ROUNDS 5: 2", "ROUNDS 5: 10", "FAST: none"]
+    assert rows[0]["lost"] == rows[0]["gained"] == 0
+    assert len({row["auc"] for row in rows}) > 1
+    assert vars(constants) == before
+    assert "ROUNDS 5: 10" in capsys.readouterr().out

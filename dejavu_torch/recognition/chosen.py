@@ -1,0 +1,46 @@
+"""What evidence and its fit are set to, along routes and over areas.
+
+All were chosen on recorded drives, on those of ``python -m benchmarks drives data/`` that are not its last
+(gardens), before other routes were asked; flights on ``python -m benchmarks areas data/``. What another value
+does on thirteen routes, ``python -m benchmarks chosen data/`` tells, whose table is on the results page about
+drives.
+"""
+
+from __future__ import annotations
+
+# Evidence: how queries depend on each other, and what a score says.
+SMALLEST = 0.05  # autocorrelation of descriptors at which the sum over lags ends, which is tau
+SHARPENED = 0.6  # tau' = SHARPENED tau queries count as one
+DETRENDED = 25  # queries to each side whose mean is a trend
+# separation, and tau over tau of detrended queries, above which slow changes, as of a train that waits,
+# do not make a query count less
+SURE, SLOW_CHANGES = 2.5, 7.0
+UNCHANGED = 0.05  # of a typical step: the queries of a stop differ less than that from its first
+STOP = 20  # queries of a stop; in a shorter one, as where frames repeat in the dark, the camera may move
+RADIUS = 5  # places around a right one whose scores are not counted as wrong
+MIN_SEPARATION = 0.3  # standard deviations of normal scores between right and wrong ones, at least
+
+# The fit: priors, and what they count as.
+ROUNDS = 5  # of expectation-maximisation
+MOVES = (0.2, 0.5, 0.2, 0.05, 0.02, 0.015, 0.015)  # one place a query, in the mean
+SLOW = (0.67, 0.25, 0.05, 0.01, 0.01, 0.005, 0.005)  # of which it starts if that at one place a query fails
+FAST = (0.05, 0.1, 0.2, 0.3, 0.2, 0.1, 0.05)
+RATES = 0.001, 0.001, 0.01  # jump, leave, enter
+MOVE_SHARE = 0.1  # of the queries: the weight of the prior of the moves
+RATE_COUNTS, ENTER_COUNTS = 200.0, 50.0  # steps that the priors of jump and leave, and of enter, count as
+# nats above being off the map by which another speed is taken, in all and per query, and times as many as at
+# one place a query
+OTHER_SPEED, PER_QUERY, CLEARLY = 30.0, 0.1, 5.0
+
+# The queries that are fitted to, for time.
+FITTED, STRETCH, STRETCHES = 1000, 100, 10  # at most; queries in a stretch, and stretches
+FEWEST_FITTED, SAMPLED = 20, 2**21  # at least; and their scores at most otherwise
+CORRELATED = 4  # correlation times in a stretch, at least
+
+# Over areas: among so many windows a right one has to stand out more than along a route.
+FLIGHT_SEPARATION, LEAST_FLIGHT_SEPARATION = 3.0, 1.0  # standard deviations of scores
+SPREADS = 2.0, 0.7, 4.0  # windows that a step goes in each direction, and where that explains little
+FLIGHT_FITTED = 300  # queries in a row, from the middle
+
+# Answers.
+DOUBT = 0.1  # nats for each deviation by which an answer's own score is worse than is usual in the drive
