@@ -607,7 +607,7 @@ MUTANTS = [
     Mutant(
         "A stop that is most of a drive is recognised.",
         "dejavu_torch/recognition/evidence.py",
-        "moving = moving[moving > UNCHANGED * moving[len(moving) * 9 // 10]]",
+        "moving = moving[moving > chosen.UNCHANGED * moving[len(moving) * 9 // 10]]",
         "pass",
         ("tests/recognition/test_smoother.py::-k any_kind",),
     ),
@@ -649,8 +649,8 @@ MUTANTS = [
     Mutant(
         "A drive far faster than the reference is found.",
         "dejavu_torch/recognition/smoother.py",
-        "others = (SLOW, FAST)",
-        "others = (SLOW, SLOW)",
+        "others = (chosen.SLOW, chosen.FAST)",
+        "others = (chosen.SLOW, chosen.SLOW)",
         ("tests/recognition/test_smoother.py::-k any_kind",),
     ),
     Mutant(
@@ -739,7 +739,7 @@ MUTANTS = [
     ),
     Mutant(
         "Answers of a drive that are nearly sure differ.",
-        "dejavu_torch/recognition/drive.py",
+        "dejavu_torch/recognition/engine.py",
         "posterior.cpu().double()",
         "posterior.cpu()",
         ("tests/recognition/test_drive.py::-k nearly_sure",),
