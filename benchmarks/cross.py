@@ -35,7 +35,7 @@ from dejavu_torch.recognition.querying import Querying
 from dejavu_torch.recognition.smoother import PlaceSmoother
 from dejavu_torch.recognition.taken import NATS, PER_QUERY, STANDS_OUT
 from dejavu_torch.recognition.views import Views
-from dejavu_torch.types import InputError, SequenceModel, Traverse
+from dejavu_torch.types import InputError, Match, SequenceModel, Traverse
 
 ASKED = 400  # queries of a drive over another route, from its middle
 SHARES = (0.5, 0.9, 0.99)
@@ -268,7 +268,19 @@ def board_of(name: str, data: Path, rate: float | None = None) -> Board:
         truth = widened(all_judged(places), first.layout, radius)
         return Board(model, (name,), described(model, Part(second, path)), truth, radius)
     routes: tuple[str, ...] = PARTS_OF_MERGED if name == MERGED else (name,)
-    footage = FOOTAGE[routes[0]]
+    reference, query, truth = traverses(FOOTAGE[routes[0]], data)
+    model.learn(reference)
+    calibrate_if_possible(model, reference)
+    if name == MERGED:
+        other = copy.deepcopy(model)
+        added = fitted(opened(FOOTAGE[routes[1]].reference, data), reference.frame_shape)
+        other.learn_features(other.descriptor.all_of(added), added)
+        model = merge([model, other], routes)
+    return Board(model, routes, described(model, query), truth, FOOTAGE[routes[0]].tolerance)
+
+
+def traverses(footage: Footage, data: Path) -> tuple[Traverse, Traverse, GroundTruth]:
+    """Reference, queries and truth of a route."""
     reference, query = (opened(one, data) for one in (footage.reference, footage.query))
     truth = truth_of(reference, query, footage.truth and footage.truth.format(data=data))
     if footage.part is not None:
@@ -280,14 +292,7 @@ def board_of(name: str, data: Path, rate: float | None = None) -> Board:
         some = inside.any(1).nonzero()[:, 0]
         query = Part(query, some)
         truth = all_judged(torch.where(inside, shown - start, -1)[some])
-    model.learn(reference)
-    calibrate_if_possible(model, reference)
-    if name == MERGED:
-        other = copy.deepcopy(model)
-        added = fitted(opened(FOOTAGE[routes[1]].reference, data), reference.frame_shape)
-        other.learn_features(other.descriptor.all_of(added), added)
-        model = merge([model, other], routes)
-    return Board(model, routes, described(model, query), truth, footage.tolerance)
+    return reference, query, truth
 
 
 def views_of(model: DejaVu) -> Views:
@@ -353,24 +358,14 @@ def facts_of(board: Board, queries: Tensor, truth: GroundTruth | None = None) ->
         and so on, the share of right ones of these, None for fewer than `FEW`; drive_auc; drive_error, of the
         probabilities.
     """
-    model, tolerance = board.model, board.tolerance
-    views, count, smoother = views_of(model), len(queries), PlaceSmoother(within=max(1, tolerance))
-    queries = queries.reshape(count * len(views.shifts), -1)
-    moved = centred(model.map, queries, len(views.shifts)) if model.centres(count) else queries
-
-    def matching(way: SequenceModel | None = None) -> Matching:
-        return model.matching(way)._replace(radius=tolerance, wrappers=(views,))
-
-    drive = model.localize_descriptors(moved, matching(smoother))
+    ways = matches(board, queries)
+    drive = ways["drive"]
     assert drive.smoother is not None
-    found: dict[str, Any] = {"queries": count, "taken": drive.is_drive, "views": drive.shift is not None}
+    found: dict[str, Any] = {"queries": len(queries), "taken": drive.is_drive}
+    found |= {"views": drive.shift is not None}
     found |= {key: value for key, value in drive.smoother.settled().items() if isinstance(value, float)}
-    ways = {"drive": drive}
-    within = {1: max(1, tolerance), 2: 0}[model.map.layout.dimensions]  # the truth has all windows of an area
-    if model.calibration is not None:
-        ways["one"] = model.localize_descriptors(moved, matching())
-        if model.calibration.filter is not None:
-            ways["filter"] = model.localize_descriptors(queries, matching(PlaceFilter()))
+    # the truth has all windows of an area
+    within = {1: max(1, board.tolerance), 2: 0}[board.model.map.layout.dimensions]
     for way, match in ways.items():
         assert match.probability is not None
         probability = match.probability
@@ -383,6 +378,24 @@ def facts_of(board: Board, queries: Tensor, truth: GroundTruth | None = None) ->
         found[f"{way}_error"] = calibration_error(known, right)
         found[f"{way}_auc"] = evaluate(match, truth, within).auc
     return found
+
+
+def matches(board: Board, queries: Tensor) -> dict[str, Match]:
+    """The answers to a drive, descriptors of all views (Q, V x K), by each of `WAYS` that there is."""
+    model, tolerance = board.model, board.tolerance
+    views, count, smoother = views_of(model), len(queries), PlaceSmoother(within=max(1, tolerance))
+    queries = queries.reshape(count * len(views.shifts), -1)
+    moved = centred(model.map, queries, len(views.shifts)) if model.centres(count) else queries
+
+    def matching(way: SequenceModel | None = None) -> Matching:
+        return model.matching(way)._replace(radius=tolerance, wrappers=(views,))
+
+    ways = {"drive": model.localize_descriptors(moved, matching(smoother))}
+    if model.calibration is not None:
+        ways["one"] = model.localize_descriptors(moved, matching())
+        if model.calibration.filter is not None:
+            ways["filter"] = model.localize_descriptors(queries, matching(PlaceFilter()))
+    return ways
 
 
 def summary(rows: Sequence[Row]) -> list[list[str]]:

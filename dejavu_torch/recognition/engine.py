@@ -70,12 +70,14 @@ class Motion(ABC):
         """What a message of the next query says of the state before: the transpose of `moved`."""
 
     def anywhere(self) -> Tensor:
-        """The belief before the first query: on or off the map in the equilibrium of leaving and entering."""
+        """The belief before the first query: in the equilibrium of leaving and entering, but on the map by
+        half at least."""
         both = (self.rates.leave + self.rates.enter).clamp(min=MIN_PROBABILITY)
         off = (self.rates.leave / both).clamp(max=0.5)
         on = 1 - off[..., None]
         places = self.states.directions * self.states.places
-        return torch.cat([(on * self.each).expand(*off.shape, places), 1 - on * self.states.share], -1)
+        off = off[..., None] + on * (1 - self.states.share)
+        return torch.cat([(on * self.each).expand(*off.shape[:-1], places), off], -1)
 
     def counts(self, before: Tensor, after: Tensor) -> Counts:
         """Expected numbers of steps (the E-step of Baum and Welch).
@@ -160,11 +162,11 @@ class Motion(ABC):
 
 
 class Block(NamedTuple):
-    """Consecutive queries from `first` on, of a sweep: (..., B, S) each, as a motion numbers states.
+    """Consecutive queries y_t from `first` on, of a sweep, at states x_t: (..., B, S) each, as the motion
+    numbers them.
 
-    before: beliefs given the queries before each. likelihood: of each query, 1 off the map. after: messages
-    of the queries after each, of any scale. log: (..., B), likelihood of each query given those before.
-    motion: which numbers the states.
+    before: beliefs p(x_t | y_1 .. y_t-1). likelihood: p(y_t | x_t) in relation to that off the map. after:
+    messages p(y_t+1 .. | x_t), of any scale. log: (..., B), log p(y_t | y_1 .. y_t-1).
     """
 
     first: int
@@ -176,7 +178,7 @@ class Block(NamedTuple):
 
     @property
     def posterior(self) -> Tensor:
-        """Probabilities of the states."""
+        """p(x_t | all queries)."""
         return normalised(self.others * self.likelihood)
 
     @property
@@ -186,7 +188,7 @@ class Block(NamedTuple):
 
     @property
     def others(self) -> Tensor:
-        """The mass of the states without each query's own evidence."""
+        """The mass of the states by the other queries, p(x_t | all but y_t), of any scale."""
         return self.before * self.after
 
 
@@ -274,8 +276,7 @@ class Fit(NamedTuple):
     """
 
     rates: Rates
-    separation: float
-    values: Tensor  # of the rank table
+    evidence: Evidence
     log: float
     held: float
 
@@ -334,41 +335,48 @@ def learn(
     samples: Sequence[FittedPart],
     ranks: RankTable,
     rates: Rates,
-    evidence: tuple[float, float, float],
+    evidence: Evidence,
+    least: float,
     again: Callable[[Counts], Rates],
-) -> tuple[Rates, float, Tensor]:
+) -> tuple[Rates, Evidence]:
     """Expectation-maximisation of rates, separation and ranks.
 
     Args:
-        samples: of one drive. ranks: of all their scores. rates: to begin with. evidence: the separation to
-            begin with, the least one, and the tempering. again: rates by counts, with those of the priors.
+        samples: of one drive. ranks: of all their scores. rates, evidence: to begin with. least: separation.
+            again: rates by counts, with those of the priors.
 
     Returns:
-        Rates, separation, and the `values` of the table of wrong scores.
+        Rates and evidence, by the `values` of the table of wrong scores.
     """
-    separation, least, tempering = evidence
-    table, z = ranks, samples[0].std.z
+    z = samples[0].std.z
     for _ in range(chosen.ROUNDS):
-        values, table, sums, counts = table.values, RankTable(ranks.counts), z.new_zeros(2), []
+        table, sums, counts = RankTable(ranks.counts), z.new_zeros(2), []
         for sample in samples:
-            motion, later = sample.over(rates), None
-            normal = RankTable.look_up(values, sample.std.z)
-            for block in explained(sample, Evidence(values, separation, tempering), motion, None, normal):
+            motion = sample.over(rates)
+            normal = RankTable.look_up(evidence.values, sample.std.z)
+            after: Tensor | None = None  # what the block behind says of its first query
+            for block in explained(sample, evidence, motion, None, normal):
                 first, last = block.first, block.first + block.log.shape[-1]
                 std, weight, *_ = sample.part(first, last)
-                known = normal.narrow(-2, first, last - first)
-                sums += motion.told(block, std, known, weight * std.speaks, table)
-                belief, after = block.before * block.likelihood, block.likelihood * block.after
-                later = after[..., 1:, :] if later is None else torch.cat([after[..., 1:, :], later], -2)
-                pair = belief[..., : later.shape[-2], :], later
-                still = sample.still[..., first + 1 : last + 1]
-                if still.any():
-                    pair = pair[0][~still], pair[1][~still]
-                counts.append(motion.counts(*pair))
-                later = after[..., :1, :]
+                sums += motion.told(
+                    block, std, normal.narrow(-2, first, last - first), weight * std.speaks, table
+                )
+                counts.append(motion.counts(*_steps(block, after, sample.still)))
+                after = block.likelihood[..., :1, :] * block.after[..., :1, :]
         separation = max(least, float(sums[0] / sums[1].clamp(min=MIN_PROBABILITY)))
+        evidence = Evidence(table.values, separation, evidence.tempering)
         rates = again(Counts(*(torch.stack(kind).sum(0) for kind in zip(*counts, strict=True))))
-    return rates, separation, table.values
+    return rates, evidence
+
+
+def _steps(block: Block, after: Tensor | None, still: Tensor) -> tuple[Tensor, Tensor]:
+    """The steps from the queries of a block to those after them, for `Motion.counts`; `after` is the message
+    of the first query behind it."""
+    before, seen = block.before * block.likelihood, (block.likelihood * block.after)[..., 1:, :]
+    after = seen if after is None else torch.cat([seen, after], -2)
+    before, first = before[..., : after.shape[-2], :], block.first + 1
+    moving = ~still[..., first : first + after.shape[-2]]
+    return (before, after) if moving.all() else (before[moving], after[moving])
 
 
 @torch.no_grad()

@@ -68,23 +68,24 @@ def place_flight(
             moves = counts.moves + prior
             return Rates(moves / moves.sum(), *rare)  # jumps are not learned
 
-        given = chosen.FLIGHT_SEPARATION, chosen.LEAST_FLIGHT_SEPARATION, tempering
-        rates, separation, values = learn([sample], ranks, Rates(kernel / kernel.sum(), *rare), given, again)
-        (log,) = nats([sample], Evidence(values, separation, tempering), rates)
-        return Fit(rates, separation, values, log, log)
+        first = Evidence(ranks.values, chosen.FLIGHT_SEPARATION, tempering)
+        rates, least = Rates(kernel / kernel.sum(), *rare), chosen.LEAST_FLIGHT_SEPARATION
+        rates, found = learn([sample], ranks, rates, first, least, again)
+        (log,) = nats([sample], found, rates)
+        return Fit(rates, found, log, log)
 
     moving = float((~sample.still).sum())
-    rates, separation, values, *_ = first_that_explains(map(fitted, chosen.SPREADS), moving, float(own.sum()))
+    rates, found, *_ = first_that_explains(map(fitted, chosen.SPREADS), moving, float(own.sum()))
     every, motion = FittedPart(std, weight, spacing.still, over), over(rates)
     mass, log = scores.new_empty(queries, layout.places), 0.0
-    for block in explained(every, Evidence(values, separation, tempering), motion):
+    for block in explained(every, found, motion):
         mass[block.first : block.first + len(block.log)] = motion.folded(block.posterior)[:, :-1]
         log += float(block.log.sum())
     log = log if math.isfinite(log) else -math.inf
     nats_per_query = tempering * log / max(1.0, float(weight.sum()))
     moves = torch.zeros(reach + 1).index_add_(0, rings(reach).flatten(), rates.moves)
     return mass, smoother.changed(
-        separation=separation,
+        separation=found.separation,
         log_likelihood=log,
         nats_per_query=nats_per_query,
         is_drive=moves_along(log, nats_per_query),

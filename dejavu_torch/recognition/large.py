@@ -149,7 +149,8 @@ class LargeDrive:
         size, fine = self.group, self.smoother
         speed = sum(move * share for move, share in enumerate(fine.prior)) / size
         links = [(one // size, two // size, share / 2) for one, two, share in self.states.links]
-        coarse = PlaceSmoother((1 - speed, speed), turn=fine.turn, links=links)
+        moves = [max(0.0, 1 - abs(speed - move)) for move in range(math.ceil(speed) + 2)]
+        coarse = PlaceSmoother(moves, turn=fine.turn, links=links)
         starts = sorted({start // size for start in self.scorer.layout.starts})
 
         def rows(numbers: Tensor) -> Tensor:

@@ -139,7 +139,7 @@ class AlongRoute(Motion):
     def told(
         self, block: Block, std: Standardised, normal: Tensor, shares: Tensor, table: RankTable
     ) -> Tensor:
-        if block.before.numel() >= loops.WORTH_COMPILING and std.valid is None:
+        if block.before.numel() >= loops.WORTH_COMPILING and std.valid is None and not self._differs:
             given = block.before, block.likelihood, block.after, std.z, normal
             found = [floats_of(one.reshape(-1, one.shape[-1])) for one in given]
             found.append(floats_of(shares.flatten()))
@@ -155,8 +155,7 @@ class AlongRoute(Motion):
     ) -> tuple[Tensor, Tensor, Tensor] | None:
         """What a loop finds, (..., B, S), (..., B) and (..., S); None if torch has to compute it."""
         *drives, queries, states = likelihood.shape
-        own_steps = (type(self).moved, type(self).expected) != (AlongRoute.moved, AlongRoute.expected)
-        if likelihood.numel() < loops.WORTH_COMPILING or own_steps:  # of a kind of motion that changes them
+        if likelihood.numel() < loops.WORTH_COMPILING or self._differs:
             return None
         count = math.prod(drives)
         each = (torch.stack(self.moves, -3)[..., 0, 0], self.free, self.gone)
@@ -172,6 +171,12 @@ class AlongRoute(Motion):
         shapes = ((out, likelihood.shape), (totals, still.shape), (own, (*drives, states)))
         before, log, last = (torch.from_numpy(one).view(shape) for one, shape in shapes)
         return before, log, last
+
+    @property
+    def _differs(self) -> bool:
+        """Whether it is of a kind of motion that changes what the loops compute."""
+        steps = "moved", "expected", "near", "folded"
+        return any(getattr(type(self), one) is not getattr(AlongRoute, one) for one in steps)
 
     def _readable(self, *tensors: Tensor) -> tuple[list[Floats], Route] | None:
         """The data of tensors, and what the loops read of the route; None if torch has to compute."""
@@ -235,7 +240,7 @@ class AlongRoute(Motion):
 
     def _counted(self, before: Tensor, after: Tensor, lost: Tensor) -> Tensor | None:
         """The weight of each move without its probability, (..., V+1), by a loop of `loops`."""
-        if before.numel() < loops.WORTH_COMPILING:
+        if before.numel() < loops.WORTH_COMPILING or self._differs:
             return None
         rows = (one.reshape(-1, one.shape[-1]) for one in (before, after))
         arrays = self._readable(*rows, lost)

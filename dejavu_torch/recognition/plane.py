@@ -43,7 +43,7 @@ class PlaneMotion(Motion):
         goes = F.conv2d(on[:, None], self.kernel.flip(2, 3), padding=self.reach)[:, 0]
         goes = (goes if self.inside is None else goes * self.inside).flatten(1)
         total = on.sum((1, 2))[:, None]
-        lost = self.kernel.sum() * total - goes.sum(1, keepdim=True)
+        lost = (self.kernel.sum() * total - goes.sum(1, keepdim=True)).clamp(min=0)
         anywhere = (self.rates.jump * total + self.rates.enter * off) * self.each
         off = (1 - self.rates.enter) * off + self.rates.leave * total + lost
         return torch.cat([goes + anywhere, off], 1).view_as(belief)

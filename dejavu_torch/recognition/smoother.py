@@ -187,7 +187,10 @@ class PlaceSmoother(SequenceModel):
     def path(
         self, scores: Tensor, descriptors: Tensor | None = None, route_starts: Sequence[int] = (0,)
     ) -> Tensor:
-        """The most probable sequence of places (Viterbi): (Q,N) -> (Q,) int64, -1 off the map."""
+        """The most probable sequence of places (Viterbi): (Q,N) -> (Q,) int64, -1 off the map.
+
+        Of several ways from one place to another, as by a link, the best one counts.
+        """
         drive = self.drive(scores, descriptors)
         motion, still = self.steps(scores.shape[1], route_starts, drive.means), drive.spacing.still
         if not isinstance(motion, AlongRoute):
@@ -251,8 +254,8 @@ class PlaceSmoother(SequenceModel):
     def blocks(
         self, drive: Drive, route_starts: Sequence[int] = (0,), size: int | None = None
     ) -> Iterator[Block]:
-        """Sweep forward, then backward: blocks of queries, the last first. In memory are one block of
-        queries, and the belief before each of the others.
+        """Sweep forward, then backward: blocks of queries, the last first. Of long drives, one block of
+        queries is in memory, and the belief before each of the others.
 
         Args:
             size: queries of a block; None is as in `size_of`.
@@ -321,7 +324,7 @@ class PlaceSmoother(SequenceModel):
         best = first_that_explains(fits, moving, different)
         nats_per_query = like.tempering * best.held / max(1.0, different)
         slow = spacing.correlation >= chosen.SLOW_CHANGES * spacing.detrended
-        slow &= best.separation >= chosen.SURE
+        slow &= best.evidence.separation >= chosen.SURE
         jump, leave, enter = map(float, best.rates[1:])
         learned = {
             "move_logits": logits(*best.rates.moves.tolist()),
@@ -334,9 +337,9 @@ class PlaceSmoother(SequenceModel):
             log_likelihood=best.log,
             jumps=best.log - best.held,
             tempering=spacing.detrended if slow else like.tempering,
-            separation=best.separation,
+            separation=best.evidence.separation,
             means=means,
-            values=best.values,
+            values=best.evidence.values,
             **{name: nn.Parameter(rate.to(self.enter_logit)) for name, rate in learned.items()},
         )
 
@@ -347,11 +350,10 @@ class PlaceSmoother(SequenceModel):
         prior = samples[0].std.z.new_tensor(start)
         rare = [prior.new_tensor(rate) for rate in self.rate_prior]
         again = partial(updated_rates, prior=prior * (chosen.MOVE_SHARE * moved), rates=self.rate_prior)
-        evidence = self.first_separation, chosen.MIN_SEPARATION, self.tempering
-        rates, separation, values = learn(samples, ranks, Rates(prior, *rare), evidence, again)
-        found = Evidence(values, separation, self.tempering)
+        first = Evidence(ranks.values, self.first_separation, self.tempering)
+        rates, found = learn(samples, ranks, Rates(prior, *rare), first, chosen.MIN_SEPARATION, again)
         log, held = nats(samples, found, rates, rates._replace(jump=rare[0], leave=rare[1]))
-        return Fit(rates, separation, values, log, held)
+        return Fit(rates, found, log, held)
 
     @torch.no_grad()
     def settled(self) -> Facts:

@@ -17,6 +17,7 @@ from dejavu_torch.places.states import States
 from dejavu_torch.recognition import loops
 from dejavu_torch.recognition.engine import Block, Motion, Rates, normalised, sweep
 from dejavu_torch.recognition.evidence import RankTable, Standardised
+from dejavu_torch.recognition.filter import PlaceFilter
 from dejavu_torch.recognition.localizer import Matching, answer
 from dejavu_torch.recognition.motion import AlongRoute
 from dejavu_torch.recognition.scorer import OfRows
@@ -135,7 +136,16 @@ def test_no_loop_replaces_steps_of_ones_own(monkeypatch):
         def moved(self, belief):
             return (belief + super().moved(belief)) / 2
 
+    class Alone(AlongRoute):
+        def near(self, mass, radius):
+            return 0 * mass
+
     monkeypatch.setattr(loops, "WORTH_COMPILING", 1)
+    rates, ones = Rates(torch.tensor([0.2, 0.8]), *torch.tensor([0.01, 0.01, 0.1])), torch.ones(1, 11)
+    table, motion = RankTable(), Alone(States(5, 2), rates)
+    std = Standardised(torch.rand(1, 5), torch.ones(1, dtype=torch.bool))
+    motion.told(Block(0, ones, ones, ones, ones[:, 0], motion), std, std.z, torch.ones(1), table)
+    assert not table.counts.any()
     slower = Slower(States(5, 2), Rates(torch.tensor([0.2, 0.8]), *torch.tensor([0.01, 0.01, 0.1])))
     belief, still = torch.eye(11)[2], torch.zeros(1, dtype=torch.bool)
     before, *_ = slower.ahead(belief, torch.ones(1, 11), still)
@@ -158,3 +168,21 @@ def test_gradients_go_through_torch(monkeypatch):
     (block,) = sweep(motion, lambda *_: seen, 4, still, 4)
     block.log.sum().backward()
     assert bool((moves.grad != 0).all())
+
+
+@pytest.mark.parametrize("leave", [0.0, 1e-12])
+def test_a_camera_that_never_leaves_may_begin_off_the_map(leave):
+    scores = torch.rand(60, 20, generator=torch.Generator().manual_seed(0))
+    smoother = PlaceSmoother(leave=leave, separation=20.0)
+    found, log = smoother.posterior(scores), smoother.log_evidence(scores)
+    log.backward()
+    assert bool(found.isfinite().all() and log.isfinite() and smoother.move_logits.grad.isfinite().all())
+
+
+def test_nothing_is_below_zero_over_an_area():
+    filter = PlaceFilter(leave=0.0, jump=0.0, enter=0.5, sharpness=6.0).over(Layout(20, 20))
+    for seed in range(20):
+        draw = torch.Generator().manual_seed(seed)
+        found = filter.posterior(torch.rand(8, 400, generator=draw)).detach()
+        assert float(found.min()) >= 0
+        filter.posterior(torch.rand(1, 400, generator=draw), found[-1])

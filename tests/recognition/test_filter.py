@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from dejavu_torch import DejaVu, PlaceFilter, SequenceMatcher
 from dejavu_torch.maps.place_map import PlaceMap
+from dejavu_torch.places.layout import Layout
 from dejavu_torch.recognition.calibration import Platt, Track
 from dejavu_torch.recognition.engine import sweep
 from dejavu_torch.recognition.filter import moments_of, near_scores
@@ -289,6 +290,8 @@ def test_no_graph_grows_from_batch_to_batch():
         (lambda: PlaceFilter(lag=2).check(10, 20), ["a lag of 2", "PlaceSmoother"]),
         (lambda: PlaceFilter().step(torch.rand(2, 4), PlaceFilter().start(3)), ["(4,)", "(5,)"]),
         (lambda: PlaceFilter().step(torch.rand(2, 4), torch.zeros(5)), ["a Tensor", "`start`"]),
+        (lambda: PlaceFilter().over(Layout(10))(torch.rand(5, 12)), ["(5, 12)", "the map's 10 places"]),
+        (lambda: PlaceFilter().over(Layout(3, 4))(torch.rand(5, 11)), ["(5, 11)", "the map's 12 places"]),
     ],
 )
 def test_bad_input_is_refused(make, told):

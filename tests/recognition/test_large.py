@@ -207,3 +207,9 @@ def test_large_maps_and_long_drives_are_large():
     assert not is_large(1, 10**6)
     assert is_large(100, 10**5)
     assert is_large(10**5, 4000)
+
+
+def test_a_prior_of_a_camera_that_is_very_fast():
+    scores = shown(700, range(20, 680, 20))
+    drive = LargeDrive(by_rows(scores, noise(33, 8)), PlaceSmoother((0,) * 20 + (1.0,)))
+    assert sum(len(own) for _, _, own, _ in drive) == 33
