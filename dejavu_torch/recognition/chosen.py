@@ -19,6 +19,9 @@ UNCHANGED = 0.05  # of a typical step: the queries of a stop differ less than th
 STOP = 20  # queries of a stop; in a shorter one, as where frames repeat in the dark, the camera may move
 RADIUS = 5  # places around a right one whose scores are not counted as wrong
 MIN_SEPARATION = 0.3  # standard deviations of normal scores between right and wrong ones, at least
+TAIL = 5  # degrees of freedom of the best scores of queries that are on the map
+NEAREST = 0.1, 0.4  # quantiles of the best scores of queries, from which those on the map are known
+MOST_ABSENT, MOST_PRESENT = 5.0, 1.0  # nats that a query's best score tells of being off, and on, the map
 
 # The fit: priors, and what they count as.
 ROUNDS = 5  # of expectation-maximisation

@@ -19,7 +19,7 @@ from dejavu_torch.recognition.calibration import Platt, best_pair, confidence, c
 from dejavu_torch.recognition.engine import Motion
 from dejavu_torch.recognition.evidence import Spacing, spacing_of
 from dejavu_torch.recognition.filter import near_scores
-from dejavu_torch.recognition.flight import place_flight
+from dejavu_torch.recognition.flight import Flight
 from dejavu_torch.recognition.large import TILE, LargeDrive, is_large
 from dejavu_torch.recognition.motion import AlongRoute
 from dejavu_torch.recognition.plane import FLOWN
@@ -237,9 +237,9 @@ def _of_flight(asked: DriveQuery, progress: bool) -> Iterator[tuple[DriveQuery, 
     """What is seen of a drive over an area."""
     scorer = asked.scorer
     spacing, queries = spacing_of(check_descriptors(scorer.descriptors)), len(scorer)
-    mass, smoother = place_flight(asked.smoother, scorer.rows, queries, scorer.layout, spacing)
-    seen = Seen(mass.double(), scorer.rows(torch.arange(queries)).cpu())
-    yield asked.fitted(smoother, spacing), seen
+    flight = Flight(asked.smoother, scorer.rows, queries, scorer.layout, spacing)
+    asked = asked.fitted(flight.smoother, spacing)
+    yield asked, Seen(flight.masses(asked.smoother).double(), flight.scores)
 
 
 def _of_windows(asked: DriveQuery, progress: bool) -> Iterator[tuple[DriveQuery, Seen]]:
@@ -247,6 +247,7 @@ def _of_windows(asked: DriveQuery, progress: bool) -> Iterator[tuple[DriveQuery,
     scorer, places = asked.scorer, asked.scorer.layout.places
     drive = LargeDrive(scorer, asked.smoother, max(2, asked.k), asked.radius, progress)
     asked = asked.fitted(drive.smoother, drive.spacing)
+    drive.smoother = asked.smoother  # which knows what single images say
     for first, mass, scores, known in drive:
         if asked.answers:
             yield asked, Seen(mass, scores, known)

@@ -296,8 +296,10 @@ class Evidence(NamedTuple):
 
     def of_normal(self, normal: Tensor, std: Standardised, weight: Tensor) -> Tensor:
         """The same, by normal scores (..., Q, N)."""
-        shares = self.separation / self.tempering * (weight * std.speaks)[..., None]
-        return std.only((normal - self.separation / 2) * shares, -math.inf)
+        shares = (weight * std.speaks / self.tempering)[..., None]
+        log = (normal - self.separation / 2) * (self.separation * shares)
+        log = log if std.absent is None else log - std.absent[..., None] * shares
+        return std.only(log, -math.inf)
 
     def likelihood(self, sample: FittedPart, motion: Motion, normal: Tensor | None = None) -> Likelihood:
         """That of a sample, 1 off the map, by its normal scores, if they are known."""

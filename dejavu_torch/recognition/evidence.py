@@ -10,6 +10,7 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
+from torch.distributions import Normal, StudentT
 
 from dejavu_torch.maps.compiling import floats_of
 from dejavu_torch.recognition import chosen, loops
@@ -22,26 +23,48 @@ COLUMNS = 256  # of descriptors that are transformed at a time
 class Spacing(NamedTuple):
     """How the queries of a drive depend on each other.
 
-    weight: (Q,) float, 1 over the length of the stop that a query belongs to, and 1 while moving.
-    still: (Q,) bool, in a stop of more than `STOP` queries, and not its first.
+    weight: (Q,) float, 1 over the length of the stop that a query belongs to, 1 while moving, 0 if stale.
+    stopped: (Q,) bool, in a stop of more than `STOP` queries, and not its first.
     correlation: tau, how many queries in a row say as much as one that is independent, at least 1.
     detrended: likewise, without slow changes, which say nothing of the noise of a query.
+    stale: (Q,) int64, how many queries in a row have repeated the picture before them, see `repeats`.
     """
 
     weight: Tensor
-    still: Tensor
+    stopped: Tensor
     correlation: float
     detrended: float
+    stale: Tensor
 
 
 def spacing_of(queries: Tensor) -> Spacing:
     """The spacing of consecutive queries by their descriptors (Q,K)."""
     queries = queries.cpu().float()
-    same = unchanged(queries)
-    length = run_lengths(same)
+    same, stale = unchanged(queries), repeats(queries)
+    fresh = stale == 0
+    length = run_lengths(same, fresh)
     moving = queries[~same]
     detrended = correlation_time(moving, lambda part: part - local_mean(part, chosen.DETRENDED))
-    return Spacing(1 / length, same & (length > chosen.STOP), correlation_time(moving), detrended)
+    stopped = same & fresh & (length > chosen.STOP)
+    return Spacing(fresh / length, stopped, correlation_time(moving), detrended, stale)
+
+
+def repeats(queries: Tensor, before: Tensor | None = None) -> Tensor:
+    """How many queries in a row, up to each, repeat the picture of the one before, as of a stream that has
+    stalled: (Q,K) -> (Q,) int64. Those of 0, as of dark frames, show no picture.
+
+    Args:
+        before: (K,), of the query before the first.
+
+    Example:
+        >>> repeats(torch.tensor([[1.0], [1], [1], [2], [0], [0]])).tolist()
+        [0, 1, 2, 0, 0, 0]
+    """
+    rows = queries if before is None else torch.cat([before[None].to(queries), queries])
+    same = torch.zeros(len(rows), dtype=torch.int64)
+    same[1:] = ((rows[1:] == rows[:-1]).all(1) & rows[1:].any(1)).cpu()
+    runs = same.cumsum(0)
+    return (runs - torch.where(same == 0, runs, 0).cummax(0).values)[len(rows) - len(queries) :]
 
 
 def unchanged(queries: Tensor) -> Tensor:
@@ -60,10 +83,10 @@ def unchanged(queries: Tensor) -> Tensor:
     return same
 
 
-def run_lengths(same: Tensor) -> Tensor:
-    """Queries of the stop that each belongs to, 1 while moving: (Q,) bool -> (Q,)."""
+def run_lengths(same: Tensor, counts: Tensor | None = None) -> Tensor:
+    """Queries of the stop that each belongs to, 1 while moving, of those that count: (Q,) bool -> (Q,)."""
     run = (~same).cumsum(0) - 1
-    return run.bincount()[run]
+    return run.bincount(None if counts is None else counts.double())[run].float()
 
 
 def local_mean(queries: Tensor, side: int) -> Tensor:
@@ -103,11 +126,13 @@ class Standardised(NamedTuple):
     """z: (..., N), how far a score lies below the mean of its query, in standard deviations; the mean of each
     place over the queries is removed first, so that no place is good for all of them. speaks: (...), False
     where all scores are equal, or not finite. valid: (..., N), which scores of the others are finite; None is
-    all, at a part of the time."""
+    all, at a part of the time. absent: (...), log likelihood ratio of being off the map by how near a query
+    comes to it, see `Presence`."""
 
     z: Tensor
     speaks: Tensor
     valid: Tensor | None = None
+    absent: Tensor | None = None
 
     def map(self, change: Callable[[Tensor], Tensor]) -> Standardised:
         """The same change of all columns."""
@@ -145,7 +170,43 @@ def speaking(scores: Tensor) -> Tensor:
     return (highest > lowest) & ~scores.isnan().any(1)
 
 
-def standardised(scores: Tensor, means: Tensor) -> Standardised:
+class Presence(NamedTuple):
+    """How near queries come to a map, by the best score of each.
+
+    On the map, they are about `on`, by a scale of `wide`, with some that are hard to recognise (Student's t).
+    Those that show nothing of it are about `off`, with a deviation of `spread`; those of ground that looks
+    like it, between `on` and `off`, the more often the farther.
+    """
+
+    on: float
+    wide: float
+    off: float
+    spread: float
+
+    def absent(self, best: Tensor) -> Tensor:
+        """Log likelihood ratio of being off the map by the best scores (...) of queries. It is bounded, and
+        says little of being on the map, as an image of other ground may come near, too."""
+        x, own = best.clamp(min=self.on, max=self.off), StudentT(chosen.TAIL, self.on, self.wide)
+        alike = 2 * (x - self.on) / (self.off - self.on) ** 2
+        off = (alike + Normal(self.off, self.spread).log_prob(x).exp()) / 2
+        told: Tensor = off.clamp(min=MIN_SHARE).log() - own.log_prob(x)
+        return told.clamp(-chosen.MOST_PRESENT, chosen.MOST_ABSENT).nan_to_num(0, 0, 0)
+
+
+def presence_of(best: Tensor, null: Tensor) -> Presence | None:
+    """From the best scores of queries (n,), of which under half may be off the map, and of queries that show
+    nothing of it, (m,); None if those are no nearer than these."""
+    best, null = (one[one.isfinite()].float().cpu() for one in (best, null))
+    if min(len(best), len(null)) < 2:
+        return None
+    share = best.new_tensor(chosen.NEAREST)
+    (low, on), (low_normal, normal) = best.quantile(share).tolist(), torch.special.ndtri(share).tolist()
+    off, least = float(null.mean()), 1e-3 * float(null.abs().mean()) + MIN_SHARE
+    wide = max(least, (on - low) / (normal - low_normal))
+    return Presence(on, wide, off, max(least, float(null.std()))) if on < off else None
+
+
+def standardised(scores: Tensor, means: Tensor, presence: Presence | None = None) -> Standardised:
     """Scores (Q,N) without the means (N,) of the places."""
     speaks, centred, valid = speaking(scores), scores - means, None
     count = torch.full_like(scores[:, :1], scores.shape[1])
@@ -158,7 +219,8 @@ def standardised(scores: Tensor, means: Tensor) -> Standardised:
     spread = (centred.square().sum(1, keepdim=True) / count).sqrt()
     speaks = speaks & (spread[:, 0] > MIN_SHARE)
     z = centred / torch.where(speaks[:, None], spread, 1)
-    return Standardised(z, speaks, None if valid is None else valid | ~speaks[:, None])
+    absent = None if presence is None else presence.absent(scores.amin(1))
+    return Standardised(z, speaks, None if valid is None else valid | ~speaks[:, None], absent)
 
 
 class RankTable:

@@ -30,64 +30,83 @@ from dejavu_torch.recognition.taken import moves_along
 BYTES = 45  # of memory for each query and window
 
 
-@torch.no_grad()
-def place_flight(
-    smoother: PlaceSmoother, rows: Rows, queries: int, layout: Layout, spacing: Spacing
-) -> tuple[Tensor, PlaceSmoother]:
-    """The mass of each window of an area for each query of a flight, (Q,N), without what is off the area, and
-    a smoother that has learned from the queries, which knows whether they are a flight over it.
+class Flight:
+    """A flight over an area, and a smoother that is fitted to its queries.
 
     Args:
         rows: scores (B,N) of queries by their numbers. queries: Q. spacing: `spacing_of` their descriptors.
 
+    Attributes:
+        scores: (Q,N). smoother: has learned from the queries, and knows whether they are over it at all.
+
     Raises:
         InputError: more queries and windows than fit into memory.
     """
-    cells = layout.rows * layout.columns
-    check_room(BYTES * queries * cells, f"a drive of {queries} images over {cells} rows x columns")
-    scores = rows(torch.arange(queries)).float().cpu()
-    if not queries:
-        return scores, smoother.forgetful()
-    weight = spacing.weight.to(scores)
-    means = smoother.removed * place_means(scores, weight)
-    std, ranks = standardised(scores, means), RankTable()
-    ranks.add(std.z, std.only((weight * std.speaks)[:, None].expand_as(std.z), 0))
-    tempering = tempering_of(spacing)
-    smoother = smoother.forgetful().changed(correlation=spacing.correlation, tempering=tempering)
-    reach, first = len(smoother.move_logits) - 1, max(0, (queries - chosen.FLIGHT_FITTED) // 2)
-    part = slice(first, first + chosen.FLIGHT_FITTED)
-    some, own = std.map(lambda column: column[part]), weight[part]
-    away, over = torch.arange(-reach, reach + 1).square(), partial(PlaneMotion, layout)
-    sample, _, *rare = FittedPart(some, own, spacing.still[part], over), *smoother.rates(own)
 
-    def fitted(spread: float) -> Fit:
-        kernel = torch.exp(-(away[:, None] + away) / (2 * spread**2)).flatten()
-        prior = chosen.MOVE_SHARE * len(own) * kernel / kernel.sum()
+    @torch.no_grad()
+    def __init__(
+        self, smoother: PlaceSmoother, rows: Rows, queries: int, layout: Layout, spacing: Spacing
+    ) -> None:
+        cells = layout.rows * layout.columns
+        check_room(BYTES * queries * cells, f"a drive of {queries} images over {cells} rows x columns")
+        self.scores, self.layout = rows(torch.arange(queries)).float().cpu(), layout
+        self.smoother = smoother.forgetful()
+        if not queries:
+            return
+        weight = spacing.weight.to(self.scores)
+        self.means = smoother.removed * place_means(self.scores, weight)
+        std, ranks = standardised(self.scores, self.means), RankTable()
+        ranks.add(std.z, std.only((weight * std.speaks)[:, None].expand_as(std.z), 0))
+        tempering = tempering_of(spacing)
+        reach, first = len(smoother.move_logits) - 1, max(0, (queries - chosen.FLIGHT_FITTED) // 2)
+        self.whole = FittedPart(std, weight, spacing.stopped, partial(PlaneMotion, layout))
+        sample = self.whole.part(first, min(queries, first + chosen.FLIGHT_FITTED))
+        away, (_, *rare) = torch.arange(-reach, reach + 1).square(), smoother.rates(weight)
 
-        def again(counts: Counts) -> Rates:
-            moves = counts.moves + prior
-            return Rates(moves / moves.sum(), *rare)  # jumps are not learned
+        def fitted(spread: float) -> Fit:
+            kernel = torch.exp(-(away[:, None] + away) / (2 * spread**2)).flatten()
+            prior = chosen.MOVE_SHARE * len(sample.weight) * kernel / kernel.sum()
 
-        first = Evidence(ranks.values, chosen.FLIGHT_SEPARATION, tempering)
-        rates, least = Rates(kernel / kernel.sum(), *rare), chosen.LEAST_FLIGHT_SEPARATION
-        rates, found = learn([sample], ranks, rates, first, least, again)
-        (log,) = nats([sample], found, rates)
-        return Fit(rates, found, log, log)
+            def again(counts: Counts) -> Rates:
+                moves = counts.moves + prior
+                return Rates(moves / moves.sum(), *rare)  # jumps are not learned
 
-    moving = float((~sample.still).sum())
-    rates, found, *_ = first_that_explains(map(fitted, chosen.SPREADS), moving, float(own.sum()))
-    every, motion = FittedPart(std, weight, spacing.still, over), over(rates)
-    mass, log = scores.new_empty(queries, layout.places), 0.0
-    for block in explained(every, found, motion):
-        mass[block.first : block.first + len(block.log)] = motion.folded(block.posterior)[:, :-1]
-        log += float(block.log.sum())
-    log = log if math.isfinite(log) else -math.inf
-    nats_per_query = tempering * log / max(1.0, float(weight.sum()))
-    moves = torch.zeros(reach + 1).index_add_(0, rings(reach).flatten(), rates.moves)
-    return mass, smoother.changed(
-        separation=found.separation,
-        log_likelihood=log,
-        nats_per_query=nats_per_query,
-        is_drive=moves_along(log, nats_per_query),
-        move_logits=nn.Parameter(logits(*moves.tolist()).to(smoother.move_logits)),
-    )
+            evidence = Evidence(ranks.values, chosen.FLIGHT_SEPARATION, tempering)
+            rates, least = Rates(kernel / kernel.sum(), *rare), chosen.LEAST_FLIGHT_SEPARATION
+            rates, found = learn([sample], ranks, rates, evidence, least, again)
+            (log,) = nats([sample], found, rates)
+            return Fit(rates, found, log, log)
+
+        moving = float((~sample.still).sum())
+        fits = map(fitted, chosen.SPREADS)
+        self.rates, self.evidence, *_ = first_that_explains(fits, moving, float(sample.weight.sum()))
+        (log,) = nats([self.whole], self.evidence, self.rates)
+        log = log if math.isfinite(log) else -math.inf
+        nats_per_query = tempering * log / max(1.0, float(weight.sum()))
+        moves = torch.zeros(reach + 1).index_add_(0, rings(reach).flatten(), self.rates.moves)
+        self.smoother = self.smoother.changed(
+            correlation=spacing.correlation,
+            tempering=tempering,
+            separation=self.evidence.separation,
+            log_likelihood=log,
+            nats_per_query=nats_per_query,
+            is_drive=moves_along(log, nats_per_query),
+            move_logits=nn.Parameter(logits(*moves.tolist()).to(smoother.move_logits)),
+        )
+
+    @torch.no_grad()
+    def masses(self, smoother: PlaceSmoother) -> Tensor:
+        """The mass of each window for each query, (Q,N), without what is off the area.
+
+        Args:
+            smoother: that of the flight, which may know what single images say.
+        """
+        if not len(self.scores):
+            return self.scores
+        presence = None if smoother.singly is None else smoother.singly.presence
+        std = standardised(self.scores, self.means, presence)
+        whole, mass = self.whole._replace(std=std), torch.empty_like(self.scores)
+        for block in explained(whole, self.evidence, whole.over(self.rates)):
+            last = block.first + len(block.log)
+            mass[block.first : last] = block.motion.folded(block.posterior)[:, :-1]
+        return mass

@@ -80,7 +80,7 @@ class LargeDrive:
             self.group *= 2
         self.states = smoother.states(self.places, scorer.layout.starts)
         self.means = self._means()
-        self.mean, self.spread, self.speaks = torch.zeros(3, self.queries)
+        self.mean, self.spread, self.speaks, self.best = torch.zeros(4, self.queries)
         best = self._pooled()
         self.windows = self._windows(best, candidates * (1 + math.ceil(radius / self.group)))
         del best
@@ -140,7 +140,7 @@ class LargeDrive:
             spread = (squares / count.clamp(min=1) - mean.square()).clamp(min=0).sqrt()
             speaks = (high > low) & (spread > MIN_SHARE)
             self.mean[part], self.spread[part] = mean.float(), torch.where(speaks, spread, 1).float()
-            self.speaks[part] = speaks.float()
+            self.speaks[part], self.best[part] = speaks.float(), low
             best[part[~speaks]] = 0
         return best
 
@@ -234,9 +234,11 @@ class LargeDrive:
     def _sample(self, window: Window, some: slice) -> FittedPart:
         z = window.z[some.start - window.start : some.stop - window.start].float()
         speaks, states = self.speaks[some] > 0, self.states.of(window.places)
-        std = Standardised(z.nan_to_num(0, 0, 0), speaks, z.isfinite() | ~speaks[:, None])
+        singly = self.smoother.singly
+        absent = singly and singly.presence and singly.presence.absent(self.best[some])
+        std = Standardised(z.nan_to_num(0, 0, 0), speaks, z.isfinite() | ~speaks[:, None], absent)
         over = partial(self.smoother.motion, states)
-        return FittedPart(std, self.spacing.weight[some], self.spacing.still[some], over)
+        return FittedPart(std, self.spacing.weight[some], self.spacing.stopped[some], over)
 
     @torch.no_grad()
     def __iter__(self) -> Iterator[tuple[int, Tensor, Tensor, Tensor]]:

@@ -29,6 +29,7 @@ from dejavu_torch.recognition.engine import (
     sweep,
 )
 from dejavu_torch.recognition.evidence import (
+    Presence,
     RankTable,
     Spacing,
     place_means,
@@ -192,7 +193,7 @@ class PlaceSmoother(SequenceModel):
         Of several ways from one place to another, as by a link, the best one counts.
         """
         drive = self.drive(scores, descriptors)
-        motion, still = self.steps(scores.shape[1], route_starts, drive.means), drive.spacing.still
+        motion, still = self.steps(scores.shape[1], route_starts, drive.means), drive.spacing.stopped
         if not isinstance(motion, AlongRoute):
             raise InputError(f"the motion is a {type(motion).__name__}; expected one along a route")
         log = motion.wide(drive.log_likelihood(torch.arange(len(scores))), 0.0)
@@ -236,20 +237,25 @@ class PlaceSmoother(SequenceModel):
         self, scores: Tensor | Rows, descriptors: Tensor | None = None, spacing: Spacing | None = None
     ) -> Drive:
         """The evidence of a drive's queries, by what was fitted; for a matrix, also if nothing was."""
+        means, values, presence = (
+            self.means,
+            self.values,
+            None if self.singly is None else self.singly.presence,
+        )
         if not isinstance(scores, Tensor):
-            spacing = spacing or spacing_of(check_descriptors(descriptors))
-            return Drive(scores, self.means, self.values, spacing, self.separation, self.tempering)
-        known = check_scores(scores, descriptors)
-        given = known.detach()
-        spacing = spacing_of(spoken(given) if descriptors is None else check_descriptors(descriptors))
-        means, values = self.means.to(given), self.values
-        if len(means) != scores.shape[1]:
-            means = self.removed * place_means(given, spacing.weight.to(given))
-        if not len(values):
-            std, table = standardised(given, means), RankTable()
-            table.add(std.z, std.only(std.speaks[:, None].expand_as(std.z), False))
-            values = table.values
-        return Drive(rows_of(known), means, values, spacing, self.separation, self.tempering)
+            rows, spacing = scores, spacing or spacing_of(check_descriptors(descriptors))
+        else:
+            known = check_scores(scores, descriptors)
+            given, rows = known.detach(), rows_of(known)
+            spacing = spacing_of(spoken(given) if descriptors is None else check_descriptors(descriptors))
+            means = means.to(given)
+            if len(means) != scores.shape[1]:
+                means = self.removed * place_means(given, spacing.weight.to(given))
+            if not len(values):
+                std, table = standardised(given, means), RankTable()
+                table.add(std.z, std.only(std.speaks[:, None].expand_as(std.z), False))
+                values = table.values
+        return Drive(rows, means, values, spacing, self.separation, self.tempering, presence)
 
     def blocks(
         self, drive: Drive, route_starts: Sequence[int] = (0,), size: int | None = None
@@ -296,7 +302,7 @@ class PlaceSmoother(SequenceModel):
         repeated = len(descriptors) / float(spacing.weight.sum())  # where frames repeat, stretches are longer
         picked = stretches(len(descriptors), spacing.correlation, places, repeated)
         known = scores(picked.flatten())
-        weight, still = spacing.weight.to(known), spacing.still.to(known.device)
+        weight, still = spacing.weight.to(known), spacing.stopped.to(known.device)
         means = self.removed * place_means(known, weight[picked.flatten()])
         std = standardised(known, means).map(lambda column: column.unflatten(0, picked.shape))
         ranks = RankTable()
@@ -360,7 +366,7 @@ class PlaceSmoother(SequenceModel):
         """What the smoother settled on, for a report."""
         _, jump, leave = self.rate_logits.softmax(0).tolist()
         singly = {} if self.singly is None else self.singly._asdict()
-        singly = {key: value for key, value in singly.items() if key not in ("nats", "least")}
+        singly = {key: value for key, value in singly.items() if key not in ("nats", "least", "presence")}
         return {
             "is_drive": self.is_drive,
             "taken": self.is_drive,
@@ -387,7 +393,8 @@ class PlaceSmoother(SequenceModel):
 class Drive(NamedTuple):
     """What a smoother knows of the queries of a drive.
 
-    means: (N,), mean score of each place. values: of the rank table.
+    means: (N,), mean score of each place. values: of the rank table. presence: how near queries come to the
+    map, if single images were asked.
     """
 
     rows: Rows
@@ -396,10 +403,11 @@ class Drive(NamedTuple):
     spacing: Spacing
     separation: float
     tempering: float
+    presence: Presence | None = None
 
     def log_likelihood(self, numbers: Tensor) -> Tensor:
         """Log likelihood of the places for some queries, 0 being off the map: (B,) -> (B,N)."""
-        std = standardised(self.rows(numbers), self.means)
+        std = standardised(self.rows(numbers), self.means, self.presence)
         weight = self.spacing.weight.cpu()[numbers].to(std.z)
         return Evidence(self.values, self.separation, self.tempering)(std, weight)
 
@@ -410,7 +418,7 @@ def blocks_together(
     """As `PlaceSmoother.blocks`, of C drives in one sweep: (C,B,S). All have as many queries, places and
     moves, and the same links."""
     means = [drive.means for _, drive in drives]
-    queries, places = len(drives[0][1].spacing.still), len(means[0])
+    queries, places = len(drives[0][1].spacing.stopped), len(means[0])
     rates = (smoother.rates(mean) for (smoother, _), mean in zip(drives, means, strict=True))
     first = drives[0][0]
     motion = first.motion(
@@ -422,7 +430,7 @@ def blocks_together(
         logs = torch.stack([drive.log_likelihood(numbers) for _, drive in drives])
         return motion.wide(logs.exp(), 1.0)
 
-    still = torch.stack([drive.spacing.still for _, drive in drives]).to(means[0].device)
+    still = torch.stack([drive.spacing.stopped for _, drive in drives]).to(means[0].device)
     yield from sweep(motion, likelihood, queries, still, size or size_of(motion, still))
 
 

@@ -16,6 +16,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from dejavu_torch.recognition.evidence import Presence, presence_of
+
 OF_MAP = 10  # queries that the map's own mean counts as, about which queries are mirrored
 FEW = 10  # queries of a drive: of fewer, single images tell nothing, and more is asked of their motion
 ASKED = 256  # queries of a drive that are asked singly, at most
@@ -42,7 +44,7 @@ Score = Callable[[Tensor], Tensor]  # numbers of queries (B,) -> scores (B,N)
 class Singly(NamedTuple):
     """How sure the surest tenth of a drive's single images is, and of queries that show no place: means of
     their confidences, at most 0, in any unit. queries: how many were asked. nats: for each, of their motion.
-    least: by what share the surest tenth has to be surer.
+    least: by what share the surest tenth has to be surer. presence: by how near they come to the map.
     """
 
     shown: float
@@ -50,6 +52,7 @@ class Singly(NamedTuple):
     queries: int
     nats: float = 0.0
     least: float = STANDS_OUT
+    presence: Presence | None = None
 
     @property
     def stands_out(self) -> bool:
@@ -115,13 +118,18 @@ def singly(own: Score, null: Callable[..., Tensor], weight: Tensor, sure: Score)
     numbers = torch.searchsorted(total, asked.double(), right=True).clamp(max=len(total) - 1)
     parts = numbers.split(max(1, AT_ONCE // own(numbers[:1]).shape[1]))
 
-    def confidences(score: Score) -> Tensor:
+    def shown(score: Score) -> tuple[Tensor, Tensor]:
+        """Confidences, and best scores."""
         found = (score(part).cpu().float() for part in parts)
-        return torch.cat([sure(scores.masked_fill(scores.isnan(), torch.inf)) for scores in found])
+        found = (scores.masked_fill(scores.isnan(), torch.inf) for scores in found)
+        pairs = [(sure(scores), scores.amin(1)) for scores in found]
+        confidences, best = (torch.cat(column) for column in zip(*pairs, strict=True))
+        return confidences, best
 
-    draws = range(math.ceil(DRAWN / len(numbers)))
-    others = torch.cat([confidences(partial(null, seed=seed)) for seed in draws])
-    return Singly(upper(confidences(own)), upper(others), len(numbers))
+    draws = [shown(partial(null, seed=seed)) for seed in range(math.ceil(DRAWN / len(numbers)))]
+    (own_sure, own_best), (others, far) = shown(own), (torch.cat(one) for one in zip(*draws, strict=True))
+    presence = presence_of(own_best, far)
+    return Singly(upper(own_sure), upper(others), len(numbers), presence=presence)
 
 
 class Running:

@@ -14,6 +14,8 @@ from dejavu_torch.recognition.evidence import (
     correlation_time,
     local_mean,
     place_means,
+    presence_of,
+    repeats,
     spacing_of,
     speaking,
     standardised,
@@ -67,22 +69,65 @@ def test_slow_changes_are_no_noise():
 
 
 def test_a_stop_counts_once():
-    """30 repeats of the fifth query with little noise, and one frame that is there twice."""
+    """30 repeats of the fifth query with little noise, and one frame that is nearly there twice."""
     moving = noise(40, 8)
-    queries = torch.cat([moving[:5], moving[4:5] + 0.001 * noise(30, 8, 1), moving[5:], moving[-1:]])
+    queries = torch.cat([moving[:5], moving[4:5] + 0.001 * noise(30, 8, 1), moving[5:], moving[-1:] + 0.001])
     stop = torch.zeros(71, dtype=torch.bool)
     stop[5:35] = True
     last = torch.arange(71) == 70
     spacing = spacing_of(queries)
     assert torch.equal(unchanged(queries), stop | last)
-    assert torch.equal(spacing.still, stop)
+    assert torch.equal(spacing.stopped, stop)
     assert torch.allclose(spacing.weight[4:35], torch.tensor(1 / 31))
     assert torch.allclose(spacing.weight[69:], torch.tensor(0.5))
     assert (spacing.weight[:4] == 1).all()
     assert (spacing.weight[35:69] == 1).all()
     alone = spacing_of(moving)
-    assert spacing[2:] == alone[2:]
-    assert spacing_of(queries.half())[2:] == pytest.approx(alone[2:], rel=0.01)
+    assert spacing[2:4] == alone[2:4]
+    assert spacing_of(queries.half())[2:4] == pytest.approx(alone[2:4], rel=0.01)
+
+
+def test_a_picture_that_repeats_is_stale_and_says_nothing():
+    moving = noise(60, 8)
+    at = torch.tensor([*range(20), *[19] * 25, *range(20, 60), 59])
+    spacing, alone = spacing_of(moving[at]), spacing_of(moving)
+    assert spacing.stale.tolist() == [*[0] * 20, *range(1, 26), *[0] * 40, 1]
+    assert spacing.weight.tolist() == (spacing.stale == 0).tolist()
+    assert not spacing.stopped.any()
+    assert spacing[2:4] == alone[2:4]
+    assert repeats(moving[at][30:32], moving[19]).tolist() == [1, 2]
+    assert repeats(moving[:0], moving[0]).tolist() == []
+    assert repeats(moving[:1], 0 * moving[0]).tolist() == [0]
+
+
+@given(st.integers(0, 99), st.sampled_from([0.1, 1.0, 50.0]))
+def test_presence_is_that_of_its_densities(seed, scale):
+    draw = torch.Generator().manual_seed(seed)
+    near, far = torch.randn(400, generator=draw), torch.randn(300, generator=draw)
+    near, far = scale * (1 + 0.2 * near), scale * (3 + 0.1 * far)
+    found = presence_of(torch.cat([near, far[:100]]), far)
+    assert found is not None
+    assert abs(found.on / scale - 1) < 0.1  # though a fifth of them are off the map
+    assert 0.1 < found.wide / scale < 0.35
+    assert (found.off, found.spread) == pytest.approx((float(far.mean()), float(far.std())))
+    best = scale * torch.linspace(-1, 5, 40)
+    told = found.absent(best)
+    for x, value in zip(best.double().clamp(found.on, found.off).tolist(), told.tolist(), strict=True):
+        alike, z = 2 * (x - found.on) / (found.off - found.on) ** 2, (x - found.off) / found.spread
+        off = (alike + math.exp(-z * z / 2) / found.spread / math.sqrt(2 * math.pi)) / 2
+        t = (x - found.on) / found.wide
+        on = 8 / (3 * math.pi * math.sqrt(5)) * (1 + t * t / 5) ** -3 / found.wide  # five degrees of freedom
+        assert value == pytest.approx(min(5, max(-1, math.log(max(off, 1e-30) / on))), abs=1e-3)
+    assert (told[1:] >= told[:-1] - 1e-4).all()
+    assert found.absent(torch.tensor([math.nan])) == 0
+
+
+@pytest.mark.parametrize(
+    "best", [torch.ones(9), torch.zeros(0), torch.full((9,), math.inf), torch.full((9,), 3.0)]
+)
+def test_queries_that_come_no_nearer_have_no_presence(best):
+    assert presence_of(best, torch.ones(20)) is None
+    assert presence_of(best, torch.zeros(0)) is None
 
 
 def test_a_slow_drift_is_no_stop():
@@ -90,7 +135,7 @@ def test_a_slow_drift_is_no_stop():
     queries = torch.cat([noise(300, 2), torch.linspace(3, 6, 200)[:, None] * torch.ones(2)])
     assert int(unchanged(queries)[300:].sum()) > 90
     assert spacing_of(queries).weight.min() > 0.2
-    assert not spacing_of(queries).still.any()
+    assert not spacing_of(queries).stopped.any()
 
 
 @pytest.mark.parametrize("queries", [torch.zeros(0, 3), torch.zeros(1, 3), torch.zeros(4, 3), noise(2, 3)])
@@ -98,8 +143,8 @@ def test_few_queries_and_equal_ones_have_a_spacing(queries):
     spacing = spacing_of(queries)
     same = len(queries) == 4
     assert spacing.weight.tolist() == [0.25 if same else 1] * len(queries)
-    assert spacing[2:] == (1, 1)
-    assert not spacing.still.any()
+    assert spacing[2:4] == (1, 1)
+    assert not spacing.stopped.any()
 
 
 def z_of(scores):

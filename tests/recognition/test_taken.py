@@ -13,6 +13,7 @@ from dejavu_torch.features.views import LabelledFrames
 from dejavu_torch.growth import learn_mean
 from dejavu_torch.recognition import taken
 from dejavu_torch.recognition.calibration import Platt
+from dejavu_torch.recognition.evidence import presence_of
 from dejavu_torch.recognition.localizer import Localizer
 from dejavu_torch.recognition.scorer import OfRows
 from dejavu_torch.recognition.taken import (
@@ -71,7 +72,8 @@ def test_the_upper_tenth_is_that_of_all_queries_asked():
     found = singly(
         lambda n: own[n, None], lambda n, seed: -10 - own[n, None] * 0, torch.ones(100), lambda s: s[:, 0]
     )
-    assert found == Singly(-5.5, -10.0, 100)
+    assert found._replace(presence=None) == Singly(-5.5, -10.0, 100)
+    assert found.presence == presence_of(own, torch.full((600,), -10.0))
     assert upper(own[:4]) == -1.0  # at least one
 
 
