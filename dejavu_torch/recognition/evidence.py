@@ -186,9 +186,11 @@ class Presence(NamedTuple):
     def absent(self, best: Tensor) -> Tensor:
         """Log likelihood ratio of being off the map by the best scores (...) of queries. It is bounded, and
         says little of being on the map, as an image of other ground may come near, too."""
-        x, own = best.clamp(min=self.on, max=self.off), StudentT(chosen.TAIL, self.on, self.wide)
+        x = best.clamp(min=self.on, max=self.off)
+        own = StudentT(chosen.TAIL, self.on, self.wide, validate_args=False)  # a score may be NaN
+        null = Normal(self.off, self.spread, validate_args=False)
         alike = 2 * (x - self.on) / (self.off - self.on) ** 2
-        off = (alike + Normal(self.off, self.spread).log_prob(x).exp()) / 2
+        off = (alike + null.log_prob(x).exp()) / 2
         told: Tensor = off.clamp(min=MIN_SHARE).log() - own.log_prob(x)
         return told.clamp(-chosen.MOST_PRESENT, chosen.MOST_ABSENT).nan_to_num(0, 0, 0)
 

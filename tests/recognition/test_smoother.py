@@ -90,7 +90,7 @@ def test_equals_a_literal_loop_in_blocks_of_any_size(smoother, shape, size, two_
 def stopped():
     """33 queries, 22 of them of a stop."""
     moving = noise(12, 2, seed=4)
-    stop = moving[1:2].double() * (1 + 1e-5 * torch.arange(21)[:, None])
+    stop = moving[1:2].double() * (1 + 1e-5 * torch.arange(1, 22)[:, None])
     return torch.cat([moving[:2].double(), stop, moving[2:].double()])
 
 
