@@ -24,9 +24,9 @@ DRIVES = (AS_IT_WAS, "a third of the speed", "three times the speed", "a stop", 
 AS_IT_IS = "as it is"
 LISTS = {"SLOW": chosen.MOVES, "FAST": chosen.MOVES}  # in place of these: no other start
 HALVED = (
-    *("SMALLEST", "SHARPENED", "DETRENDED", "SURE", "SLOW_CHANGES", "UNCHANGED", "STOP", "RADIUS"),
+    *("SMALLEST", "SHARPENED", "UNCHANGED", "STOP", "RADIUS", "TAIL", "MOST_ABSENT", "MOST_PRESENT"),
     *("MIN_SEPARATION", "ROUNDS", "MOVE_SHARE", "RATE_COUNTS", "ENTER_COUNTS", "OTHER_SPEED", "PER_QUERY"),
-    *("CLEARLY", "FITTED", "STRETCH", "CORRELATED", "DOUBT"),
+    *("FITTED", "STRETCH", "CORRELATED", "DOUBT"),
 )
 COLUMNS: dict[str, Column] = {
     **{"AUC": ("auc", ".4f"), "most lost": ("lost", ".3f"), "most gained": ("gained", ".3f")},

@@ -11,10 +11,6 @@ from __future__ import annotations
 # Evidence: how queries depend on each other, and what a score says.
 SMALLEST = 0.05  # autocorrelation of descriptors at which the sum over lags ends, which is tau
 SHARPENED = 0.6  # tau' = SHARPENED tau queries count as one
-DETRENDED = 25  # queries to each side whose mean is a trend
-# separation, and tau over tau of detrended queries, above which slow changes, as of a train that waits,
-# do not make a query count less
-SURE, SLOW_CHANGES = 2.5, 7.0
 UNCHANGED = 0.05  # of a typical step: the queries of a stop differ less than that from its first
 STOP = 20  # queries of a stop; in a shorter one, as where frames repeat in the dark, the camera may move
 RADIUS = 5  # places around a right one whose scores are not counted as wrong
@@ -31,9 +27,10 @@ FAST = (0.05, 0.1, 0.2, 0.3, 0.2, 0.1, 0.05)
 RATES = 0.001, 0.001, 0.01  # jump, leave, enter
 MOVE_SHARE = 0.1  # of the queries: the weight of the prior of the moves
 RATE_COUNTS, ENTER_COUNTS = 200.0, 50.0  # steps that the priors of jump and leave, and of enter, count as
-# nats above being off the map by which another speed is taken, in all and per query, and times as many as at
-# one place a query
-OTHER_SPEED, PER_QUERY, CLEARLY = 30.0, 0.1, 5.0
+OTHER_SPEED, PER_QUERY = (
+    30.0,
+    0.1,
+)  # nats above being off the map that one speed explains, in all and per query
 
 # The queries that are fitted to, for time.
 FITTED, STRETCH, STRETCHES = 1000, 100, 10  # at most; queries in a stretch, and stretches

@@ -8,7 +8,6 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 from torch.distributions import Normal, StudentT
 
@@ -26,14 +25,12 @@ class Spacing(NamedTuple):
     weight: (Q,) float, 1 over the length of the stop that a query belongs to, 1 while moving, 0 if stale.
     stopped: (Q,) bool, in a stop of more than `STOP` queries, and not its first.
     correlation: tau, how many queries in a row say as much as one that is independent, at least 1.
-    detrended: likewise, without slow changes, which say nothing of the noise of a query.
     stale: (Q,) int64, how many queries in a row have repeated the picture before them, see `repeats`.
     """
 
     weight: Tensor
     stopped: Tensor
     correlation: float
-    detrended: float
     stale: Tensor
 
 
@@ -43,10 +40,8 @@ def spacing_of(queries: Tensor) -> Spacing:
     same, stale = unchanged(queries), repeats(queries)
     fresh = stale == 0
     length = run_lengths(same, fresh)
-    moving = queries[~same]
-    detrended = correlation_time(moving, lambda part: part - local_mean(part, chosen.DETRENDED))
     stopped = same & fresh & (length > chosen.STOP)
-    return Spacing(fresh / length, stopped, correlation_time(moving), detrended, stale)
+    return Spacing(fresh / length, stopped, correlation_time(queries[~same]), stale)
 
 
 def repeats(queries: Tensor, before: Tensor | None = None) -> Tensor:
@@ -89,17 +84,8 @@ def run_lengths(same: Tensor, counts: Tensor | None = None) -> Tensor:
     return run.bincount(None if counts is None else counts.double())[run].float()
 
 
-def local_mean(queries: Tensor, side: int) -> Tensor:
-    """The mean of the queries up to `side` before and after each, (Q,K) -> (Q,K)."""
-    sums = F.pad(queries.double().cumsum(0), (0, 0, 1, 0))
-    at = torch.arange(len(queries), device=queries.device)
-    first, last = (at - side).clamp(min=0), (at + side + 1).clamp(max=len(queries))
-    return ((sums[last] - sums[first]) / (last - first)[:, None]).to(queries)
-
-
-def correlation_time(queries: Tensor, change: Callable[[Tensor], Tensor] = Tensor.double) -> float:
-    """1 + 2 x the autocorrelations of the centred descriptors (Q,K), up to the first below .05; of columns
-    that are changed first.
+def correlation_time(queries: Tensor) -> float:
+    """1 + 2 x the autocorrelations of the centred descriptors (Q,K), up to the first below .05.
 
     Example:
         >>> correlation_time(torch.tensor([[1.0], [-1], [1], [-1]]))
@@ -110,8 +96,8 @@ def correlation_time(queries: Tensor, change: Callable[[Tensor], Tensor] = Tenso
         return 1.0
     power = torch.zeros(count + 1, dtype=torch.float64, device=queries.device)
     for part in queries.split(COLUMNS, 1):  # which the cache holds
-        part = change(part)
-        centred = (part - part.mean(0)).double()
+        part = part.double()
+        centred = part - part.mean(0)
         power += torch.fft.rfft(centred, n=2 * count, dim=0).abs().square().sum(1)
     if not power.sum() > 0:
         return 1.0

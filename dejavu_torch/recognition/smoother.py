@@ -329,8 +329,6 @@ class PlaceSmoother(SequenceModel):
         fits = (like._fitted(samples, ranks, start, moving) for start in (self.prior, *others))
         best = first_that_explains(fits, moving, different)
         nats_per_query = like.tempering * best.held / max(1.0, different)
-        slow = spacing.correlation >= chosen.SLOW_CHANGES * spacing.detrended
-        slow &= best.evidence.separation >= chosen.SURE
         jump, leave, enter = map(float, best.rates[1:])
         learned = {
             "move_logits": logits(*best.rates.moves.tolist()),
@@ -342,7 +340,6 @@ class PlaceSmoother(SequenceModel):
             is_drive=moves_along(best.held, nats_per_query),
             log_likelihood=best.log,
             jumps=best.log - best.held,
-            tempering=spacing.detrended if slow else like.tempering,
             separation=best.evidence.separation,
             means=means,
             values=best.evidence.values,
@@ -436,13 +433,12 @@ def blocks_together(
 
 def first_that_explains(fits: Iterator[Fit], moving: float, different: float) -> Fit:
     """What was found from the first start, or, if that explains little of the queries that are moving, from
-    another speed, if this explains far more of those that are different."""
+    another speed, if this explains those that are different."""
     first = next(fits)
     if first.log >= max(chosen.OTHER_SPEED, chosen.PER_QUERY * moving):
         return first
     other = max(fits, key=lambda one: one.log, default=first)
-    least = max(chosen.OTHER_SPEED, chosen.PER_QUERY * different, chosen.CLEARLY * first.log)
-    return other if other.log >= least else first
+    return other if other.log >= max(chosen.OTHER_SPEED, chosen.PER_QUERY * different) else first
 
 
 def rows_of(scores: Tensor) -> Rows:

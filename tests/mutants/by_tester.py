@@ -759,13 +759,6 @@ MUTANTS = [
         ("tests/recognition/test_smoother.py::-k nothing", "tests/recognition/test_evidence.py"),
     ),
     Mutant(
-        "Changes far slower than the noise of the queries make none say less.",
-        "dejavu_torch/recognition/smoother.py",
-        "tempering=spacing.detrended if slow else like.tempering",
-        "tempering=like.tempering",
-        ("tests/recognition/test_smoother.py::-k that_are_slow",),
-    ),
-    Mutant(
         "The places of a window are a share of the map, and jumps to others leave them.",
         "dejavu_torch/recognition/motion.py",
         "left + (1 - states.share) * self.free",

@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 from dejavu_torch.recognition.evidence import (
     RankTable,
     correlation_time,
-    local_mean,
     place_means,
     presence_of,
     repeats,
@@ -58,16 +57,6 @@ def test_the_correlation_time_is_a_sum_over_pairs(seed, rows):
     assert correlation_time(torch.ones(rows, 3)) == 1
 
 
-def test_slow_changes_are_no_noise():
-    slow = torch.sin(torch.arange(1000.0) / 200)[:, None] * torch.ones(20)
-    spacing = spacing_of(noise(1000, 20) + 3 * slow)
-    assert spacing.correlation > 50
-    assert spacing.detrended < 1.5
-    queries = noise(9, 2).double()
-    means = [queries[max(0, t - 2) : t + 3].mean(0) for t in range(9)]
-    assert torch.allclose(local_mean(queries, 2), torch.stack(means))
-
-
 def test_a_stop_counts_once():
     """30 repeats of the fifth query with little noise, and one frame that is nearly there twice."""
     moving = noise(40, 8)
@@ -83,8 +72,8 @@ def test_a_stop_counts_once():
     assert (spacing.weight[:4] == 1).all()
     assert (spacing.weight[35:69] == 1).all()
     alone = spacing_of(moving)
-    assert spacing[2:4] == alone[2:4]
-    assert spacing_of(queries.half())[2:4] == pytest.approx(alone[2:4], rel=0.01)
+    assert spacing.correlation == alone.correlation
+    assert spacing_of(queries.half()).correlation == pytest.approx(alone.correlation, rel=0.01)
 
 
 def test_a_picture_that_repeats_is_stale_and_says_nothing():
@@ -94,7 +83,7 @@ def test_a_picture_that_repeats_is_stale_and_says_nothing():
     assert spacing.stale.tolist() == [*[0] * 20, *range(1, 26), *[0] * 40, 1]
     assert spacing.weight.tolist() == (spacing.stale == 0).tolist()
     assert not spacing.stopped.any()
-    assert spacing[2:4] == alone[2:4]
+    assert spacing.correlation == alone.correlation
     assert repeats(moving[at][30:32], moving[19]).tolist() == [1, 2]
     assert repeats(moving[:0], moving[0]).tolist() == []
     assert repeats(moving[:1], 0 * moving[0]).tolist() == [0]
@@ -143,7 +132,7 @@ def test_few_queries_and_equal_ones_have_a_spacing(queries):
     spacing = spacing_of(queries)
     same = len(queries) == 4
     assert spacing.weight.tolist() == [0.25 if same else 1] * len(queries)
-    assert spacing[2:4] == (1, 1)
+    assert spacing.correlation == 1
     assert not spacing.stopped.any()
 
 

@@ -376,16 +376,6 @@ def test_stretches_are_spread_over_the_drive(queries, correlation):
     assert (picked[1:, 0] > picked[:-1, -1]).all()
 
 
-def test_changes_that_are_slow_make_no_query_say_less():
-    """Light that comes and goes in 200 queries, beside noise of a query."""
-    slow = torch.sin(torch.arange(800) / 200 * 2 * math.pi)[:, None] + noise(800, 4)
-    clear, unclear = (shown(900, range(800), clear=one) for one in (6.0, 1.2))
-    found = PlaceSmoother().fit(clear, slow)
-    assert found.correlation > 15
-    assert found.tempering == pytest.approx(1, abs=0.3)
-    assert PlaceSmoother().fit(unclear, slow).tempering > 9
-
-
 def test_queries_that_say_nothing_do_not_make_the_others_say_more():
     walk = noise(200, 12, seed=1).cumsum(0)
     scores = torch.cdist(walk[20:180], walk) + 50
