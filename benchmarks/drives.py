@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -52,6 +53,7 @@ ROUTES: dict[str, tuple[Route, str | None]] = {
     "floors": (drive("floors_rejection", 1), CORRIDOR),
     "gardens": (Route(GARDENS.format("reference"), GARDENS.format("query"), 1, "0"), None),
 }
+NOISE = 0.01  # of a typical step, in frames that repeat one
 STOP, BESIDE, THRICE, RANDOM = 200, 150, 400, 500  # queries
 STRETCHES = ((5, 15), (5, 40), (20, 40))
 AS_IT_WAS, HALF, ELSEWHERE = "as it was", "half of it off the map", "another route"
@@ -183,10 +185,21 @@ def asked(known: Known, numbers: Tensor) -> tuple[Tensor, GroundTruth]:
     """The queries of a drive by their numbers, and their truth: those of the other route have no place."""
     own, at = numbers >= 0, numbers.clamp(min=0)
     queries, (positives, judged, ignored) = known.queries[at], known.truth
+    queries = queries + _noise(queries, numbers)
     if known.other is not None:
         queries = torch.where(own[:, None], queries, known.other[(-1 - numbers).clamp(min=0)])
     places = [torch.where(own[:, None], table[at], -1) for table in (positives, ignored)]
     return queries, GroundTruth(places[0], judged[at] | ~own, places[1])
+
+
+def _noise(queries: Tensor, numbers: Tensor) -> Tensor:
+    """A little noise, (Q,K), of queries that repeat the frame before them: as of a camera that stands, whose
+    pictures are never the same bit by bit. Those that are belong to a stream that has stalled."""
+    steps = (queries[1:] - queries[:-1]).norm(dim=1)
+    typical = float(steps[steps > 0].median()) if bool((steps > 0).any()) else 0.0
+    noise = torch.randn(queries.shape, generator=torch.Generator().manual_seed(0))
+    again = torch.cat([numbers[:1] != numbers[:1], numbers[1:] == numbers[:-1]])
+    return again[:, None] * noise * (NOISE * typical / math.sqrt(max(1, queries.shape[1])))
 
 
 def facts_of(known: Known, numbers: Tensor) -> dict[str, Any]:

@@ -116,8 +116,8 @@ class Motion(ABC):
         own, others = (self.folded(one)[..., :-1] for one in (block.posterior, normalised(block.others)))
         shares = shares[..., None]
         table.add(std.z, std.only(-shares * self.near(own, chosen.RADIUS), 0))
-        others = others * shares
-        return torch.stack([(others * std.only(normal, 0)).sum(), others.sum()])
+        others = std.only(others * shares, 0)
+        return torch.stack([(others * normal).nansum(), others.sum()])
 
     def near(self, mass: Tensor, radius: int) -> Tensor:
         """The mass of each place and its neighbours up to a radius, (..., N) -> (..., N)."""
@@ -299,7 +299,8 @@ class Evidence(NamedTuple):
         shares = (weight * std.speaks / self.tempering)[..., None]
         log = (normal - self.separation / 2) * (self.separation * shares)
         log = log if std.absent is None else log - std.absent[..., None] * shares
-        return std.only(log, -math.inf)
+        log = std.only(log, -math.inf)
+        return log if std.holes is None else log.masked_fill(std.holes, 0)
 
     def likelihood(self, sample: FittedPart, motion: Motion, normal: Tensor | None = None) -> Likelihood:
         """That of a sample, 1 off the map, by its normal scores, if they are known."""

@@ -113,12 +113,14 @@ class Standardised(NamedTuple):
     place over the queries is removed first, so that no place is good for all of them. speaks: (...), False
     where all scores are equal, or not finite. valid: (..., N), which scores of the others are finite; None is
     all, at a part of the time. absent: (...), log likelihood ratio of being off the map by how near a query
-    comes to it, see `Presence`."""
+    comes to it, see `Presence`. holes: (..., N), places that no query has a score at: a query there is off
+    the map, but the camera may pass; None is no place."""
 
     z: Tensor
     speaks: Tensor
     valid: Tensor | None = None
     absent: Tensor | None = None
+    holes: Tensor | None = None
 
     def map(self, change: Callable[[Tensor], Tensor]) -> Standardised:
         """The same change of all columns."""
@@ -135,15 +137,16 @@ def all_finite(scores: Tensor) -> bool:
 
 
 def place_means(scores: Tensor, weight: Tensor) -> Tensor:
-    """The mean score of each place over the queries that say something, (Q,N), (Q,) -> (N,); 0 for a single
-    query, of which nothing would be left."""
+    """The mean score of each place over the queries that say something, (Q,N), (Q,) -> (N,); +inf where none
+    has a score, and 0 for a single query, of which nothing would be left."""
     if len(scores) == 1:
         return torch.zeros_like(scores[0])
     weight = weight * speaking(scores)
     if all_finite(scores):
         return weight @ scores / weight.sum().clamp(min=MIN_SHARE)
     valid = scores.isfinite()
-    return weight @ torch.where(valid, scores, 0) / (weight @ valid.to(weight)).clamp(min=MIN_SHARE)
+    total, share = weight @ torch.where(valid, scores, 0), weight @ valid.to(weight)
+    return torch.where(share > 0, total / share.clamp(min=MIN_SHARE), math.inf)
 
 
 def speaking(scores: Tensor) -> Tensor:
@@ -208,7 +211,9 @@ def standardised(scores: Tensor, means: Tensor, presence: Presence | None = None
     speaks = speaks & (spread[:, 0] > MIN_SHARE)
     z = centred / torch.where(speaks[:, None], spread, 1)
     absent = None if presence is None else presence.absent(scores.amin(1))
-    return Standardised(z, speaks, None if valid is None else valid | ~speaks[:, None], absent)
+    holes = None if valid is None else ~means.isfinite()
+    holes = holes.expand_as(z) if holes is not None and holes.any() and not holes.all() else None
+    return Standardised(z, speaks, None if valid is None else valid | ~speaks[:, None], absent, holes)
 
 
 class RankTable:

@@ -98,9 +98,9 @@ class PlaceFilter(SequenceModel):
         L-th before the latest that it has not given yet.
 
     Convention: causal. exp(-score) is at most the probability that the right place is within `within` places.
-        A place that nothing covers scores +inf. `moves` to `off_map` are parameters. The state of `step` is a
-        `FilterState`; in an exported graph it is one tensor, see `packed`. With a lag of all queries but one,
-        the answers are those of forward-backward smoothing.
+        A place that nothing covers is passed as one off the map, and scores +inf. `moves` to `off_map` are
+        parameters. The state of `step` is a `FilterState`; in an exported graph it is one tensor, see `packed`.
+        With a lag of all queries but one, the answers are those of forward-backward smoothing.
 
     Source: the topometric filter of Xu, Fischer, Sünderhauf and Milford (RA-L 2021) has an off-map state; the
         motion model and the likelihood are ours.
@@ -299,8 +299,8 @@ class PlaceFilter(SequenceModel):
         off = self.off_map.to(z)
         if learned is not None:
             sharpness, off = learned.likelihood(sharpness, off)
-        off = off.expand(len(z), 1)
-        logits = torch.cat([(sharpness * z).masked_fill(~valid, -math.inf), sharpness * off], 1)
+        # a query at a place without a score is off the map, but the camera may pass
+        logits = sharpness * torch.cat([z.where(valid, off), off.expand(len(z), 1)], 1)
         logits = torch.where(moments.varied, logits, 0)
         return (logits - logits.amax(1, keepdim=True)).exp()
 

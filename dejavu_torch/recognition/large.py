@@ -98,7 +98,7 @@ class LargeDrive:
                 total[some] += weight @ scores.where(valid, 0)
                 share[some] += weight @ valid.float()
         means: Tensor = self.smoother.removed * total / share.clamp(min=MIN_SHARE)
-        return means
+        return means.where(share > 0, math.inf)
 
     def _scores(self, verb: str) -> Iterator[tuple[Tensor, Iterator[tuple[int, Tensor]]]]:
         """Numbers of queries, and blocks of their scores."""
@@ -236,7 +236,9 @@ class LargeDrive:
         speaks, states = self.speaks[some] > 0, self.states.of(window.places)
         singly = self.smoother.singly
         absent = singly and singly.presence and singly.presence.absent(self.best[some])
-        std = Standardised(z.nan_to_num(0, 0, 0), speaks, z.isfinite() | ~speaks[:, None], absent)
+        holes = self.means[window.places].isinf().expand_as(z)
+        valid = z.isfinite() | ~speaks[:, None]
+        std = Standardised(z.nan_to_num(0, 0, 0), speaks, valid, absent, holes if holes.any() else None)
         over = partial(self.smoother.motion, states)
         return FittedPart(std, self.spacing.weight[some], self.spacing.stopped[some], over)
 

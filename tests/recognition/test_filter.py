@@ -48,8 +48,8 @@ def literal(filter_, scores):
         mean = sum(known) / len(known) if known else 0.0
         spread = math.sqrt(sum((score - mean) ** 2 for score in known) / len(known)) if known else 0.0
         if spread > 0:
-            z = [(mean - score) / spread if math.isfinite(score) else -math.inf for score in row]
-            z.append(float(filter_.off_map))
+            off = float(filter_.off_map)  # at a place that nothing covers, too
+            z = [(mean - score) / spread if math.isfinite(score) else off for score in row] + [off]
             joint = [b * math.exp(sharpness * one) for b, one in zip(belief, z, strict=True)]
             if sum(joint) > 0:
                 belief = [one / sum(joint) for one in joint]

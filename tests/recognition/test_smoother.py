@@ -441,3 +441,20 @@ def test_the_module_says_what_it_has_settled_on():
 def test_bad_input_is_refused(make, told):
     with refused(*told):
         make()
+
+
+def test_a_hole_is_passed_and_no_answer():
+    """Places 20 to 39 have no scores: queries there are off the map, those behind are found at once."""
+    scores = shown(80, range(80))
+    scores[:, 20:40] = math.inf
+    smoother = PlaceSmoother().fit(scores)
+    posterior = smoother.posterior(scores)
+    assert smoother.is_drive
+    assert (posterior[:, :-1].argmax(1) - torch.arange(80)).abs().max() <= 3  # the camera goes on in it
+    found = smoother(scores)
+    assert found[:, 20:40].isinf().all()
+    assert (-found[24:36].amin(1)).exp().max() < 0.5
+    assert (-found[42:].amin(1)).exp().min() > 0.5
+    with_few = scores.clone()
+    with_few[5, 20:40] = 9.0  # one query that has them: they are no hole
+    assert PlaceSmoother().fit(with_few).posterior(with_few)[30, 20:40].sum() < 0.1
