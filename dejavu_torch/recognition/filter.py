@@ -99,7 +99,7 @@ class PlaceFilter(SequenceModel):
 
     Convention: causal. exp(-score) is at most the probability that the right place is within `within` places.
         A place that nothing covers is passed as one off the map, and scores +inf. `moves` to `off_map` are
-        parameters. The state of `step` is a `FilterState`; in an exported graph it is one tensor, see `packed`.
+        parameters. The state of `step` is a `FilterState`; an exported graph has one tensor, see `packed`.
         With a lag of all queries but one, the answers are those of forward-backward smoothing.
 
     Source: the topometric filter of Xu, Fischer, Sünderhauf and Milford (RA-L 2021) has an off-map state; the

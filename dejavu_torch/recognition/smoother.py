@@ -433,12 +433,13 @@ def blocks_together(
 
 def first_that_explains(fits: Iterator[Fit], moving: float, different: float) -> Fit:
     """What was found from the first start, or, if that explains little of the queries that are moving, from
-    another speed, if this explains those that are different."""
+    another speed, if this explains far more of those that are different."""
     first = next(fits)
     if first.log >= max(chosen.OTHER_SPEED, chosen.PER_QUERY * moving):
         return first
     other = max(fits, key=lambda one: one.log, default=first)
-    return other if other.log >= max(chosen.OTHER_SPEED, chosen.PER_QUERY * different) else first
+    least = max(chosen.OTHER_SPEED, chosen.PER_QUERY * different, chosen.CLEARLY * first.log)
+    return other if other.log >= least else first
 
 
 def rows_of(scores: Tensor) -> Rows:
