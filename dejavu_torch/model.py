@@ -548,7 +548,9 @@ class DejaVu(nn.Module):
         if not (together or (querying.centres(False) and not turned)):
             localizer = self.localizer(matching.as_it_drives())
             batches = self.descriptor.batches(copies, progress, "localizing", on_first)
-            yield from map(localizer, (set_apart(self.map, rows) if turned else rows for rows in batches))
+            for rows in batches:
+                match = localizer(set_apart(self.map, rows) if turned else rows)
+                yield match if sequence is not None else replace(match, stale=None)
             return
         descriptors = self.described(queries, querying, centres, progress, on_first)
         yield answer(self.scorer(descriptors, matching), matching, progress)

@@ -268,6 +268,9 @@ class Match:
         shift: float, by how much the camera points further right than at learning, in shares of the width,
             NaN where nothing tells it; of the first candidate. None unless views of the queries are compared.
         shift_degrees: the same in degrees, if the camera's field of view is known.
+        stale: int64, how many queries in a row, up to this one, repeat the picture of the one before them,
+            bit by bit, as of a stream that has stalled: the camera may have moved on. None if the order of
+            the queries does not count.
         sequences: by T, matches (Q,) of the same queries in sequences, a filter or a smoother, for reports;
             mostly empty.
         smoother: of a whole drive, the `PlaceSmoother` as it was fitted to the queries, which tells whether
@@ -283,12 +286,13 @@ class Match:
     heading: Tensor | None = None
     shift: Tensor | None = None
     shift_degrees: Tensor | None = None
+    stale: Tensor | None = None
     sequences: Mapping[Together, Match] = field(default_factory=dict)
     smoother: SequenceModel | None = None
 
     @property
     def columns(self) -> dict[str, Tensor]:
-        """Those of the nine columns that are known, by name."""
+        """Those of the ten columns that are known, by name."""
         return {name: column for name, column in vars(self).items() if isinstance(column, Tensor)}
 
     @property

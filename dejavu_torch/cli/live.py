@@ -162,12 +162,13 @@ def _with_warning(camera: Camera) -> Iterable[Frame]:
 def line_of(image: Frame, match: LiveMatch) -> str:
     """An answer as a line of JSON."""
     answer = match._asdict() | {"milliseconds": round(match.milliseconds, 3)}
-    names = ("place", "frame", "route", "x", "y", "shift", "shift_degrees")
-    place, frame, route, x, y, shift, turn = (answer.pop(name) for name in names)
+    names = ("place", "frame", "route", "x", "y", "shift", "shift_degrees", "stale")
+    place, frame, route, x, y, shift, turn, stale = (answer.pop(name) for name in names)
     facts = {"frame": image.number, "time": image.seconds, "place": place, "reference_frame": frame, **answer}
     facts |= {} if math.isnan(x) else {"x": x, "y": y}
     facts |= {} if math.isnan(shift) else {"shift": round(shift, 4)}
     facts |= {} if math.isnan(turn) else {"shift_degrees": round(turn, 2)}
+    facts |= {"stale": stale} if stale else {}
     return json.dumps(without_nan(facts | ({"route": route} if route else {})))
 
 

@@ -24,7 +24,7 @@ from dejavu_torch.types import InputError, Match
 
 log = logging.getLogger("dejavu_torch")
 
-TOLD = "probability", "confidence", "heading", "shift", "shift_degrees"  # if they are known
+TOLD = "probability", "confidence", "heading", "shift", "shift_degrees", "stale"  # if they are known
 NUMBERS, NAMES = ("query", "place", "score", "accepted"), ("query_name", "place_name")
 EXPECTED = "columns query,place,score and optionally accepted, probability, confidence, rank, route"
 ELSEWHERE = -2  # the place of an answer on another route
@@ -96,13 +96,13 @@ def write_matches(
             queries = torch.arange(first, total) if query_frames is None else query_frames[first:total]
             places, own = table.frame_of(match.index), table.own_frame_of(match.index)
             rank = torch.arange(each).repeat(len(queries)) + 1
-            right, sure, turn, aside, by = (match.columns.get(name, match.score) for name in TOLD)
+            right, sure, turn, aside, by, again = (match.columns.get(name, match.score) for name in TOLD)
             route, at = layout.route_of(match.index), layout.coordinates(match.index)
             whole = queries.repeat_interleave(each), places, own, match.accepted, rank, route
-            parts = match.score, right, sure, turn, aside, by, *at.unbind(1)
+            parts = match.score, right, sure, turn, aside, by, again, *at.unbind(1)
             rows = (zip(*(one.tolist() for one in columns), strict=True) for columns in (whole, parts))
             for (query, place, number, good, order, on), own in zip(*rows, strict=True):
-                score, chance, margin, north, shift, by, x, y = own
+                score, chance, margin, north, shift, by, again, x, y = own
                 row = {
                     "query": query,
                     "place": number,
@@ -113,6 +113,7 @@ def write_matches(
                     "heading": _number(north),
                     "shift": _number(shift, 3),
                     "shift_degrees": _number(by, 3),
+                    "stale": _number(again),
                     "rank": order,
                     "route": printable(layout.names("")[on]) if on >= 0 else "",
                     "x": _number(x, 9),

@@ -27,6 +27,7 @@ EXPECTED = "uint8 (H,W), (H,W,3) or (3,H,W), or float in [0, 1], or float (D,) f
 DTYPES = ("uint8", "float16", "bfloat16", "float32", "float64")
 SMALL = (HOG, Distilled, PatchPixels)  # features that one thread computes as fast as several
 MAX_SKIPPED = 100  # skipped frames that a filter moves for; after more, a jump finds the place again
+AGES = 0.9  # by which a single frame's probability falls with each frame that repeats the picture before it
 ROUNDING = 1e-3  # tolerance of the range [0, 1]
 
 
@@ -46,6 +47,7 @@ class LiveMatch(NamedTuple):
     y: float = math.nan
     shift: float = math.nan  # of the camera, see `Match`
     shift_degrees: float = math.nan
+    stale: int = 0  # frames in a row that repeat one picture, see `Match`
 
 
 class LiveLocalizer:
@@ -111,6 +113,7 @@ class LiveLocalizer:
     def reset(self) -> None:
         """Forget all frames."""
         self.scores: Tensor | None = None
+        self._latest: tuple[Tensor, Tensor] | None = None  # descriptors as they are, and centred
         place_map = self.model.map
         self._mean = torch.zeros(place_map.dimension + 1, device=place_map.device)  # of the frames so far
         matching, self._driven = self.model.matching(self.sequence), self._views.as_it_drives(describes=True)
@@ -139,7 +142,11 @@ class LiveLocalizer:
         if self.turned:
             descriptor = set_apart(self.model.map, descriptor)
         if self.centring is not None:
-            descriptor, mean = self.centring(descriptor, mean, len(descriptor))
+            if self._latest is not None and torch.equal(self._latest[0], descriptor):
+                descriptor, mean = self._latest[1], self._mean  # a picture that repeats counts once
+            else:
+                raw, (descriptor, mean) = descriptor, self.centring(descriptor, mean, len(descriptor))
+                self._latest = raw, descriptor
         with in_one_thread(self.model.map.places):
             self._localizer.skip(min(left_out, MAX_SKIPPED))
             match = self._localizer(descriptor)
@@ -170,20 +177,27 @@ class LiveLocalizer:
         place, score, table = int(match.index), float(match.score), model.map.table
         shown, layout = int(table.frame_of(match.index)), model.map.layout
         x, y = layout.coordinates(match.index).tolist()
+        stale = 0 if match.stale is None else int(match.stale)
+        probability = math.nan if match.probability is None else float(match.probability)
+        accepted, precision = bool(match.accepted), self._localizer.matching.acceptance.precision
+        if self.sequence is None:  # which knows of no motion: the picture is older with each frame
+            probability *= AGES**stale
+            accepted &= precision is None or probability >= precision
         return LiveMatch(
             place=place,
             frame=int(table.own_frame_of(match.index)),
             name=model.frame_names[shown] if model.frame_names and shown >= 0 else "",
             score=score,
             posterior=math.exp(-score) if self._filters else math.nan,
-            probability=math.nan if match.probability is None else float(match.probability),
-            accepted=bool(match.accepted),
+            probability=probability,
+            accepted=accepted,
             milliseconds=milliseconds,
             route=layout.names("")[int(layout.route_of(match.index))] if place >= 0 else "",
             x=x,
             y=y,
             shift=math.nan if match.shift is None else float(match.shift),
             shift_degrees=math.nan if match.shift_degrees is None else float(match.shift_degrees),
+            stale=stale,
         )
 
     @property

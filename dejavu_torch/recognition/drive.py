@@ -56,6 +56,7 @@ class DriveQuery(NamedTuple):
         scorer: of all queries. k: candidates. radius: suppression radius in places.
         platt: the calibration of single queries, if there is one.
         asks: single images say first whether it is a drive of the map at all.
+        stale: (Q,), see `Spacing`; None before the smoother is fitted.
     """
 
     scorer: Scorer
@@ -64,6 +65,7 @@ class DriveQuery(NamedTuple):
     radius: int = 5
     platt: Platt | None = None
     asks: bool = True
+    stale: Tensor | None = None
 
     @property
     def answers(self) -> bool:
@@ -81,7 +83,8 @@ class DriveQuery(NamedTuple):
             found = singly(scorer.rows, scorer.null, spacing.weight.cpu(), sure)
             found = found._replace(nats=smoother.nats_per_query, least=SURER[layout.dimensions])
             is_drive &= found.stands_out
-        return self._replace(smoother=smoother.changed(is_drive=is_drive, singly=found))
+        smoother = smoother.changed(is_drive=is_drive, singly=found)
+        return self._replace(smoother=smoother, stale=spacing.stale)
 
 
 class Seen(NamedTuple):
@@ -177,6 +180,7 @@ def _joined(asked: DriveQuery, parts: list[Shown]) -> Answers:
         empty = torch.zeros(0, k)
         smoother = asked.smoother.forgetful()
         match = Match(empty.long(), empty, empty.bool(), empty.double(), confidence=empty, smoother=smoother)
+        match = replace(match, stale=empty.long())
         return Answers(match, torch.zeros(0).double())
     match = Match.joined(part.match for part in parts)
     absent, sure, probability, own = (torch.cat(column) for column in [*zip(*parts, strict=True)][1:])
@@ -186,7 +190,8 @@ def _joined(asked: DriveQuery, parts: list[Shown]) -> Answers:
     match = replace(match, score=match.score.to(own.dtype))
     confidences = first_of(sure.to(own.dtype), k)
     match = replace(match, probability=first_of(probability, k), confidence=confidences)
-    return Answers(replace(match, smoother=asked.smoother), absent)
+    stale = None if asked.stale is None else asked.stale[:, None].expand_as(match.index)
+    return Answers(replace(match, smoother=asked.smoother, stale=stale), absent)
 
 
 def _seen(

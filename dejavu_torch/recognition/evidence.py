@@ -44,12 +44,12 @@ def spacing_of(queries: Tensor) -> Spacing:
     return Spacing(fresh / length, stopped, correlation_time(queries[~same]), stale)
 
 
-def repeats(queries: Tensor, before: Tensor | None = None) -> Tensor:
+def repeats(queries: Tensor, before: Tensor | None = None, so_far: int = 0) -> Tensor:
     """How many queries in a row, up to each, repeat the picture of the one before, as of a stream that has
     stalled: (Q,K) -> (Q,) int64. Those of 0, as of dark frames, show no picture.
 
     Args:
-        before: (K,), of the query before the first.
+        before: (K,), the query before the first. so_far: how many, up to that one.
 
     Example:
         >>> repeats(torch.tensor([[1.0], [1], [1], [2], [0], [0]])).tolist()
@@ -59,7 +59,8 @@ def repeats(queries: Tensor, before: Tensor | None = None) -> Tensor:
     same = torch.zeros(len(rows), dtype=torch.int64)
     same[1:] = ((rows[1:] == rows[:-1]).all(1) & rows[1:].any(1)).cpu()
     runs = same.cumsum(0)
-    return (runs - torch.where(same == 0, runs, 0).cummax(0).values)[len(rows) - len(queries) :]
+    found = (runs - torch.where(same == 0, runs, 0).cummax(0).values)[len(rows) - len(queries) :]
+    return found + so_far * (found == torch.arange(1, len(found) + 1))
 
 
 def unchanged(queries: Tensor) -> Tensor:

@@ -54,20 +54,22 @@ class FilterState(NamedTuple):
         posterior: (N+1,), of the latest answer, which with a lag depends on later queries as well.
         learned: what the queries so far tell, if the filter learns.
         waiting: (R,N), scores of the queries that wait for their answers.
-        left_out: after each of these, how many queries were left out.
+        left_out: after each of these, how many queries were left out. absent: (R,), see `PlaceFilter.step`.
     """
 
     belief: Tensor
     posterior: Tensor
     learned: Learned | Followed | None
     waiting: Tensor
-    left_out: tuple[int, ...] = ()
+    left_out: tuple[int, ...]
+    absent: Tensor
 
     def to(self, like: Tensor) -> FilterState:
         """The same, of the type and on the device of a tensor."""
         learned = self.learned and type(self.learned)(*(one.to(like) for one in self.learned))
-        belief, posterior, waiting = (one.to(like) for one in (self.belief, self.posterior, self.waiting))
-        return FilterState(belief, posterior, learned, waiting, self.left_out)
+        rows = self.belief, self.posterior, self.waiting, self.absent
+        belief, posterior, waiting, absent = (one.to(like) for one in rows)
+        return FilterState(belief, posterior, learned, waiting, self.left_out, absent)
 
 
 class PlaceFilter(SequenceModel):
@@ -162,7 +164,7 @@ class PlaceFilter(SequenceModel):
         new = self.off_map.detach().new_zeros
         kind, moves = self._learned, len(self.move_logits)
         learned = None if kind is None else kind.unpacked(new(kind.size(places, moves)), places, moves)
-        return FilterState(new(places + 1), new(places + 1), learned, new(0, places))
+        return FilterState(new(places + 1), new(places + 1), learned, new(0, places), (), new(0))
 
     def packed(self, state: FilterState) -> Tensor:
         """The state of a filter without a lag: its belief (N+1,), or, if it learns, that and what is learned
@@ -177,7 +179,7 @@ class PlaceFilter(SequenceModel):
         places, rows = state.shape[-1] - 1, state.reshape(-1, state.shape[-1])
         kind, learned = self._learned, rows[1:].flatten()
         known = None if kind is None else kind.unpacked(learned, places, len(self.move_logits))
-        return FilterState(rows[0], rows[0], known, state.new_zeros(0, places))
+        return FilterState(rows[0], rows[0], known, state.new_zeros(0, places), (), state.new_zeros(0))
 
     def forward(self, scores: Tensor, before: Tensor | None = None) -> Tensor:
         if scores.ndim > 2:
@@ -202,9 +204,20 @@ class PlaceFilter(SequenceModel):
         return self._answers(scores, state, last=True)[0]
 
     def step(
-        self, scores: Tensor, state: FilterState, route_starts: Sequence[int] = (0,), last: bool = False
+        self,
+        scores: Tensor,
+        state: FilterState,
+        route_starts: Sequence[int] = (0,),
+        last: bool = False,
+        absent: Tensor | None = None,
     ) -> tuple[Tensor, FilterState]:
-        posteriors, answered, state = self._answers(scores, state, route_starts, last)
+        """As of every `SequenceModel`.
+
+        Args:
+            last: no queries follow, so all that wait are answered. absent: (B,), nats that speak for being
+                off the map, by what is known of each query beside its scores; none by default.
+        """
+        posteriors, answered, state = self._answers(scores, state, route_starts, last, absent)
         return self.near(posteriors[:, :-1], answered), state
 
     def finish(self, state: FilterState, route_starts: Sequence[int] = (0,)) -> tuple[Tensor, FilterState]:
@@ -232,7 +245,12 @@ class PlaceFilter(SequenceModel):
 
     @without_autocast
     def _answers(
-        self, scores: Tensor, state: FilterState, route_starts: Sequence[int] = (0,), last: bool = False
+        self,
+        scores: Tensor,
+        state: FilterState,
+        route_starts: Sequence[int] = (0,),
+        last: bool = False,
+        absent: Tensor | None = None,
     ) -> tuple[Tensor, Tensor, FilterState]:
         """Posteriors (A,N+1) of the queries whose answers are due, or of all, their scores (A,N), and the
         next state."""
@@ -246,18 +264,21 @@ class PlaceFilter(SequenceModel):
         if state.belief.shape != (places + 1,):
             shapes = f"the posterior is {tuple(state.belief.shape)}; expected {(places + 1,)}"
             raise InputError(f"{shapes} for this map")
-        belief, posterior, learned, waiting, left = state.to(scores)
+        belief, posterior, learned, waiting, left, known_absent = state.to(scores)
+        absent = scores.new_zeros(len(scores)) if absent is None else absent.to(scores)
+        absent = torch.cat([known_absent, absent])
         left_out = (*left, *[0] * len(scores))
         scores = torch.cat([waiting, scores]) if len(waiting) else scores
         moments, motion = moments_of(scores), self.motion(scores, route_starts, learned)
-        likelihoods = self.likelihoods(scores, moments) if learned is None else scores  # else in turn
+        likelihoods = scores if learned else self.likelihoods(scores, moments, None, absent)  # else in turn
         posteriors, due = [], len(scores) if last else max(0, len(scores) - self.lag)
         for t in range(due):
             ahead = slice(t, t + 1 + self.lag)
             seen = likelihoods[ahead]
             if learned is not None:
                 motion = self.motion(scores, route_starts, learned)
-                seen = self.likelihoods(scores[ahead], Moments(*(one[ahead] for one in moments)), learned)
+                some = Moments(*(one[ahead] for one in moments))
+                seen = self.likelihoods(scores[ahead], some, learned, absent[ahead])
             expected = motion.moved(belief)
             if t == 0:
                 expected = torch.where((belief == 0).all(), motion.anywhere(), expected)
@@ -276,7 +297,7 @@ class PlaceFilter(SequenceModel):
         return (
             answers,
             scores[:due],
-            FilterState(belief, posterior, learned, scores[due:], left_out[due:]),
+            FilterState(belief, posterior, learned, scores[due:], left_out[due:], absent[due:]),
         )
 
     def _message(self, motion: Motion, likelihoods: Tensor, left_out: Sequence[int]) -> Tensor:
@@ -290,17 +311,22 @@ class PlaceFilter(SequenceModel):
         return message
 
     def likelihoods(
-        self, scores: Tensor, moments: Moments, learned: Learned | Followed | None = None
+        self,
+        scores: Tensor,
+        moments: Moments,
+        learned: Learned | Followed | None = None,
+        absent: Tensor | None = None,
     ) -> Tensor:
         """Likelihoods of the places and of being off the map, (Q,N) -> (Q,N+1), scaled to a maximum of 1 in
-        each row."""
+        each row; `absent` as in `step`."""
         valid, sharpness = scores.isfinite(), self.log_sharpness.to(scores).exp()
         z = torch.where(valid, moments.mean - scores, 0) / moments.spread
         off = self.off_map.to(z)
         if learned is not None:
             sharpness, off = learned.likelihood(sharpness, off)
         # a query at a place without a score is off the map, but the camera may pass
-        logits = sharpness * torch.cat([z.where(valid, off), off.expand(len(z), 1)], 1)
+        off = off.expand(len(z), 1) if absent is None else off + absent[:, None] / sharpness
+        logits = sharpness * torch.cat([z.where(valid, off), off], 1)
         logits = torch.where(moments.varied, logits, 0)
         return (logits - logits.amax(1, keepdim=True)).exp()
 

@@ -7,7 +7,7 @@ import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -18,6 +18,7 @@ from dejavu_torch.places.layout import ROUTE, Layout
 from dejavu_torch.recognition.calibration import TOLERANCE, Platt, Track, best_pair, confidence_of
 from dejavu_torch.recognition.calibration import confidence as confidence_of_pair
 from dejavu_torch.recognition.drive import DriveQuery, answer_drives, first_of
+from dejavu_torch.recognition.evidence import repeats
 from dejavu_torch.recognition.filter import FilterState
 from dejavu_torch.recognition.scorer import OfMap, Scorer, of_stored
 from dejavu_torch.recognition.search import Search, Searcher
@@ -101,6 +102,9 @@ class Localizer:
         self.asks = None if filters and matching.platt is not None else False
         # probabilities, each by itself, of queries that a filter has yet to answer
         self.alone = torch.empty(0, dtype=torch.float64)
+        self.last: Tensor | None = None  # the latest query
+        self.run = 0  # how many have repeated one picture up to it, see `repeats`
+        self.stale = torch.empty(0, dtype=torch.int64)  # likewise, of queries that wait for their answers
         self.searcher = searcher
         self.own: Together = "filter" if sequence is None else sequence.key
         self.models: dict[Together, SequenceModel] = {**matching.also}
@@ -132,18 +136,27 @@ class Localizer:
         wanted = [(k, radius), (min(2, self.layout.places), TOLERANCE)]
         if self.models or self.matching.callback is not None:  # they need all scores
             wanted = []
-        parts = list[Match]()
+        parts, stale = list[Match](), repeats(scorer.descriptors, self.last, self.run)
         for part in with_progress(scorer.parts(wanted), verb, progress):
             if wanted:
                 match = self._alone(*scorer.best(part, wanted))
             else:
-                match = self.match(scorer.rows(part), scorer.stored, self._mirrored(scorer, part))
+                again = stale[part][:, None] > 0 if self.own == "filter" else None
+                match = self.match(scorer.rows(part), scorer.stored, self._mirrored(scorer, part), again)
             parts.append(self._told(match, scorer, part))
-        return self._without_blank(Match.joined(parts), scorer)
+        self.last, self.run = scorer.descriptors[-1].clone(), int(stale[-1])
+        self.stale = torch.cat([self.stale, stale])
+        return self._with_stale(self._without_blank(Match.joined(parts), scorer))
+
+    def _with_stale(self, match: Match) -> Match:
+        """Answers with how often their pictures had been repeated."""
+        count, shape = len(match), (-1, *[1] * (match.index.ndim - 1))
+        stale, self.stale = self.stale[:count], self.stale[count:]
+        return replace(match, stale=stale.view(shape).expand_as(match.index))
 
     def _mirrored(self, scorer: Scorer, queries: Tensor) -> Tensor | None:
-        """Confidences in some of the queries, mirrored, (B,), NaN for the others, if a filter's answers get
-        probabilities."""
+        """Confidences in some of the queries, mirrored, and their best scores, (B,2), NaN for the others, if
+        a filter's answers get probabilities."""
         if self.asks is None:
             self.asks = scorer.null is not None
         if not self.asks:
@@ -151,35 +164,52 @@ class Localizer:
         descriptors = scorer.descriptors[queries.to(scorer.descriptors.device)]
         numbers = torch.arange(len(descriptors)) + self.running.queries
         sums = self.total.to(descriptors) + descriptors.nan_to_num(0).cumsum(0)
-        found = torch.full((len(descriptors),), math.nan)
+        found = torch.full((len(descriptors), 2), math.nan)
         some = (numbers < AT_FIRST) | (numbers % EVERY == 0)
         if bool(some.any()):
             so_far = sums[some], 1 + numbers.to(sums)[some, None]
-            scores = scorer.mirrored(queries[some], so_far=so_far)
-            found[some] = confidence_of(scores, self.layout).cpu().to(found)
+            found[some] = self._alone_told(scorer.mirrored(queries[some], so_far=so_far)).to(found)
         self.total = sums[-1]
         return found
 
+    def _alone_told(self, scores: Tensor) -> Tensor:
+        """Confidences in single images, and their best scores, (B,N) -> (B,2)."""
+        best = scores.masked_fill(scores.isnan(), math.inf).amin(1)
+        return torch.stack([confidence_of(scores, self.layout).cpu(), best.cpu()], 1)
+
     @torch.no_grad()
-    def match(self, scores: Tensor, stored: Tensor | None = None, mirrored: Tensor | None = None) -> Match:
+    def match(
+        self,
+        scores: Tensor,
+        stored: Tensor | None = None,
+        mirrored: Tensor | None = None,
+        again: Tensor | None = None,
+    ) -> Match:
         """Match the next queries by their scores: (B,N) -> (B,), or (B,k).
 
         Args:
-            stored: the only places that single images find, (n,). mirrored: see `_mirrored`.
+            stored: the only places that single images find, (n,). mirrored: see `_mirrored`. again: (B,1),
+                which repeat a picture: they tell a filter nothing, but the camera may have moved.
         """
+        if not self.models:
+            return self._alone(scores if stored is None else of_stored(scores, stored))
+        again = torch.zeros(len(scores), 1, dtype=torch.bool) if again is None else again
+        if bool(again.any()):
+            known = scores.isfinite()
+            most = scores.where(known, -math.inf).amax(1, keepdim=True)
+            scores = torch.where(again.to(scores.device) & known, most, scores)
+        absent = odds = None
         if mirrored is not None:
-            odds = self.running(confidence_of(scores, self.layout).cpu(), mirrored)
+            odds, absent = self.running(self._alone_told(scores).masked_fill(again, math.nan), mirrored)
             platt = self.matching.single or Platt(0.0, math.inf)
             alone = platt.probability(confidence_of(scores, self.layout, platt.margin))
             self.alone = torch.cat([self.alone, alone])
-            match = self.match(scores, stored)
-            return self._doubted(match, odds[len(odds) - len(match.index) :])
-        if not self.models:
-            return self._alone(scores if stored is None else of_stored(scores, stored))
+        size = max(1, CACHED // scores.shape[1])
+        absent = torch.zeros(len(scores)) if absent is None else absent
         with in_one_thread(scores.shape[1]):
-            return Match.joined(
-                self._in_sequence(part, stored) for part in scores.split(max(1, CACHED // scores.shape[1]))
-            )
+            pairs = zip(scores.split(size), absent.split(size), strict=True)
+            match = Match.joined(self._in_sequence(part, stored, absent=one) for part, one in pairs)
+        return match if odds is None else self._doubted(match, odds[len(odds) - len(match.index) :])
 
     def _told(self, match: Match, scorer: Scorer, queries: Tensor) -> Match:
         """The match of queries with what copies tell of them, if these answer now."""
@@ -208,7 +238,7 @@ class Localizer:
         if self.matching.sequence is None or not self.matching.sequence.lag or not self.states:
             return self.match(torch.zeros(0, places))
         owed = self.matching.sequence.waiting(self.states[self.own])
-        match = self._in_sequence(owed[:0], last=True)
+        match = self._with_stale(self._in_sequence(owed[:0], last=True))
         return self._doubted(match, torch.tensor(self.running.odds)) if len(self.alone) else match
 
     def _doubted(self, match: Match, odds: Tensor) -> Match:
@@ -237,9 +267,19 @@ class Localizer:
             self._answer(self._candidates(part), best_pair(part, self.layout)) for part in parts
         )
 
-    def _in_sequence(self, scores: Tensor, stored: Tensor | None = None, last: bool = False) -> Match:
+    def _in_sequence(
+        self,
+        scores: Tensor,
+        stored: Tensor | None = None,
+        last: bool = False,
+        absent: Tensor | None = None,
+    ) -> Match:
         states = self.states or {T: m.start(scores.shape[1]) for T, m in self.models.items()}
-        steps = {T: m.step(scores, states[T], self.route_starts) for T, m in self.models.items()}
+        told: dict[str, dict[str, Any]] = {"filter": {} if absent is None else {"absent": absent}}
+        steps = {
+            T: m.step(scores, states[T], self.route_starts, **told.get(m.answers, {}))
+            for T, m in self.models.items()
+        }
         sequence, found = self.matching.sequence, {T: final for T, (final, _) in steps.items()}
         if sequence is not None and sequence.lag:
             if last:
@@ -321,7 +361,8 @@ def answer(
         return replace(alone, sequences=found.sequences)
     if way is not None:
         return _as_it_drives(scorer, matching, progress, verb)
-    return Localizer(None, matching, layout=scorer.layout).next(scorer, progress, verb)
+    match = Localizer(None, matching, layout=scorer.layout).next(scorer, progress, verb)
+    return replace(match, stale=None)  # each image is answered by itself
 
 
 def _as_it_drives(scorer: Scorer, matching: Matching, progress: bool, verb: str) -> Match:

@@ -23,6 +23,8 @@ FEW = 10  # queries of a drive: of fewer, single images tell nothing, and more i
 ASKED = 256  # queries of a drive that are asked singly, at most
 DRAWN = 512  # queries that show nothing, at least, for the upper tenth to be the same each time
 AT_FIRST, EVERY = 40, 4  # of a filter's queries, those that are asked mirrored as well: the first, then some
+KNOWN = 20  # queries, and mirrored ones, from which on a filter knows how near they come to the map
+FILTERED = 2.0  # of a filter's queries say as much as one, of being off the map
 UPPER = 0.1  # share of the queries that have to be sure: the others may be off the map
 # of `python -m benchmarks cross`: by what share of the null's level the surest tenth is surer; the second one
 # will do if the motion alone shows so many nats for each query
@@ -133,30 +135,50 @@ def singly(own: Score, null: Callable[..., Tensor], weight: Tensor, sure: Score)
 
 
 class Running:
-    """`Singly.odds` of the queries so far, from histograms, which do not grow with them."""
+    """`Singly.odds` and `Presence` of the queries so far, from histograms, which do not grow with them."""
 
     def __init__(self, least: float = STANDS_OUT) -> None:
         self.least = least
         self.counts = Counter[int](), Counter[int]()  # by -log(-confidence), of queries and of mirrored ones
+        self.best = Counter[int](), Counter[int]()  # by the logarithm of their best score
         self.odds, self.queries = 1.0, 0
+        self.presence: Presence | None = None
 
-    def __call__(self, own: Tensor, mirrored: Tensor) -> Tensor:
-        """The odds at each of the next queries, (B,) float64.
+    def __call__(self, own: Tensor, mirrored: Tensor) -> tuple[Tensor, Tensor]:
+        """The odds at each of the next queries, and nats that speak for being off the map, (B,) float64 each.
 
         Args:
-            own, mirrored: confidences in the queries and in some of them mirrored, (B,), NaN for the others.
+            own, mirrored: confidences in the queries and in some of them mirrored, and their best scores,
+                (B,2), NaN for the others.
         """
-        found = []
+        odds, absent = [], []
         for pair in torch.stack([own, mirrored], 1).cpu().double().tolist():
-            for counts, confidence in zip(self.counts, pair, strict=True):
+            for counts, best, (confidence, score) in zip(self.counts, self.best, pair, strict=True):
                 if confidence > -math.inf:  # nor NaN
                     counts[round(PER_E * math.log(max(-confidence, SUREST)))] += 1
+                    best[round(PER_E * math.log(max(score, SUREST)))] += 1
             self.queries += 1
             if all(self.counts):
                 shown, null = map(self._upper, self.counts)
                 self.odds = Singly(shown, null, self.queries, least=self.least).odds
-            found.append(self.odds)
-        return torch.tensor(found, dtype=torch.float64)
+            odds.append(self.odds)
+            absent.append(self._absent(pair[0][1]))
+        return torch.tensor(odds, dtype=torch.float64), torch.tensor(absent, dtype=torch.float64)
+
+    def _absent(self, best: float) -> float:
+        """`Presence.absent`, of a filter; 0 while few queries are known."""
+        if self.queries % EVERY == 0 and min(one.total() for one in self.best) >= KNOWN:
+            self.presence = presence_of(*map(self._sample, self.best))
+        if self.presence is None or not best > 0:
+            return 0.0
+        return float(self.presence.absent(torch.tensor(best))) / FILTERED
+
+    @staticmethod
+    def _sample(counts: Counter[int]) -> Tensor:
+        """Best scores, of a histogram, at most about `DRAWN`."""
+        each = max(1, counts.total() // DRAWN)
+        places, times = torch.tensor([*counts.items()]).unbind(1)
+        return (places / PER_E).exp().repeat_interleave(-(-times // each))
 
     @staticmethod
     def _upper(counts: Counter[int]) -> float:

@@ -199,7 +199,8 @@ def test_frames_left_out_move_the_filter_on(route):
 def test_names_and_interruption(spectral, drive, monkeypatch):
     localizer = LiveLocalizer(spectral)
     monkeypatch.setattr(spectral.state, "frame_names", [f"{i}.png" for i in range(PLACES)])
-    assert localizer(drive[0]).name == f"{localizer(drive[0]).frame}.png"
+    found = localizer(drive[0])
+    assert found.name == f"{found.frame}.png"
 
     def interrupted(queries):
         raise KeyboardInterrupt

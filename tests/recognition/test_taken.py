@@ -141,17 +141,26 @@ def test_motion_has_to_pay_for_its_jumps():
 def test_a_running_number_is_that_of_all_so_far_in_any_batches():
     draw = torch.Generator().manual_seed(0)
     own, null = (-torch.rand(2, 300, generator=draw)).double()
-    null = torch.where(torch.arange(300) % 4 == 0, null * 1.5, math.nan)
+    asked = torch.arange(300) % 4 == 0
+    null = torch.where(asked, null * 1.5, math.nan)
+    best, far = 0.2 + 0.1 * torch.rand(300, generator=draw).double(), torch.where(asked, 0.8, math.nan)
+    far += 0.05 * torch.randn(300, generator=draw)
+    best[200:] = 0.78  # off the map
+    pairs = torch.stack([own, best], 1), torch.stack([null, far], 1)
     running, parts = Running(), Running()
-    at_once = running(own, null)
-    assert torch.equal(
-        at_once, torch.cat([parts(own[a:b], null[a:b]) for a, b in ((0, 1), (1, 90), (90, 300))])
-    )
+    odds, absent = running(*pairs)
+    some = [parts(*(one[a:b] for one in pairs)) for a, b in ((0, 1), (1, 90), (90, 300))]
+    for whole, pieces in zip((odds, absent), zip(*some, strict=True), strict=True):
+        assert torch.equal(whole, torch.cat(pieces))
     for n in (1, 57, 300):
         known = null[:n][~null[:n].isnan()]
         expected = Singly(upper(own[:n]), upper(known), n)
-        assert float(at_once[n - 1]) == expected.odds
-    assert Running()(own[:3], torch.full((3,), math.nan)).tolist() == [1, 1, 1]  # nothing to compare with
+        assert float(odds[n - 1]) == expected.odds
+    assert not absent[:76].any()  # of 19 mirrored ones
+    assert float(absent[80:200].mean()) < 0
+    assert float(absent[200:].min()) > 0.5
+    alone = torch.stack([torch.full((3,), math.nan)] * 2, 1)
+    assert [one.tolist() for one in Running()(pairs[0][:3], alone)] == [[1, 1, 1], [0, 0, 0]]
 
 
 def test_other_ground_is_no_drive_although_its_frames_are_in_order(model):
