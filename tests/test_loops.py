@@ -14,6 +14,7 @@ from helpers import refused
 from dejavu_torch import DejaVu, PlaceFilter, open_source
 from dejavu_torch.data.ground_truth import as_ground_truth, of_loops
 from dejavu_torch.evaluation.compare import compare
+from dejavu_torch.recognition.evidence import standing
 from dejavu_torch.recognition.querying import Querying
 
 
@@ -59,6 +60,38 @@ def test_only_earlier_places_are_right():
     assert of_loops(truth, queries, 20).positives.tolist() == [[0, 1, -1], [-1] * 3, [-1] * 3, [-1] * 3]
     with refused("over 70 frames before"):
         of_loops(truth, queries, 70)
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.2])
+@pytest.mark.parametrize("drive", [False, True])
+def test_a_wait_is_no_loop(noise, drive):
+    """120 frames of a place, by the same picture or with noise, on the second lap."""
+    rows = twice()
+    at = torch.tensor([*range(180), *[180] * 120, *range(180, 240)])
+    waits = torch.arange(360).sub(180).clamp(0, 120)
+    waits = F.normalize(rows[at] + (waits % 120 > 0)[:, None] * noise / 4 * torch.randn(360, 16), dim=1)
+    match = DejaVu(whitening="none").learn(waits).loops(waits, 50, drive)
+    accepted = match.accepted[200:300]
+    assert ((match.index[200:300] < 120) | ~accepted).all()  # but the first lap is found
+    if drive:
+        assert match.accepted[[*range(150, 180), *range(310, 340)]].all()
+    truth = of_loops(as_ground_truth([[0, 178, 190]] * 2), torch.tensor([200, 299]), 50)
+    assert truth.positives.tolist() == [[0, -1, -1], [0, 178, 190]]  # by frames
+    where = torch.stack([at.double(), 0 * at], 1)
+    assert int(standing(where).sum()) == 120
+    truth = of_loops(
+        as_ground_truth([[0, 178, 190]] * 2), torch.tensor([200, 299]), 50, (~standing(where)).cumsum(0)
+    )
+    assert truth.positives.tolist() == [[0, -1, -1]] * 2
+
+
+@pytest.mark.parametrize(
+    "queries", [torch.zeros(0, 3), torch.ones(1, 3), torch.randn(300, 4), torch.ones(30, 2)]
+)
+def test_what_moves_or_is_short_is_no_wait(queries):
+    assert not standing(queries).any()
+    assert not standing(torch.randn(200, 6).cumsum(0)).any()
+    assert not standing(torch.full((200, 2), torch.nan)).any()
 
 
 def test_the_commands_find_and_score_loops(tmp_path):

@@ -201,9 +201,16 @@ def widened(truth: GroundTruth, layout: Layout, radius: int) -> GroundTruth:
     return truth._replace(positives=near.masked_fill((truth.positives < 0)[..., None], -1).flatten(1))
 
 
-def of_loops(truth: GroundTruth, queries: Tensor, apart: int) -> GroundTruth:
-    """A ground truth (Q,R) of which only places over `apart` frames before the query (Q,) are right."""
-    positives = torch.where(truth.positives < queries[:, None] - apart, truth.positives, -1)
+def of_loops(truth: GroundTruth, queries: Tensor, apart: int, passed: Tensor | None = None) -> GroundTruth:
+    """A ground truth (Q,R) of which only places over `apart` frames before the query (Q,) are right.
+
+    Args:
+        passed: how many frames have moved, up to each place and query (N,); None is all of them.
+    """
+    count = 1 + int(max(queries.max(), truth.positives.max()))
+    passed = torch.arange(count) if passed is None or len(passed) < count else passed
+    before = passed[truth.positives.clamp(min=0)] < passed[queries, None] - apart
+    positives = torch.where(before, truth.positives, -1)
     expect((positives >= 0).any(), "loops", f"no query comes back to a place over {apart} frames before")
     return truth._replace(positives=positives)
 

@@ -53,6 +53,7 @@ from dejavu_torch.model import DejaVu, check_apart, check_loops_along, check_que
 from dejavu_torch.motion.resampling import ground_truth_of, resampled, source_of
 from dejavu_torch.places.layout import Reach
 from dejavu_torch.recognition.centring import centred
+from dejavu_torch.recognition.evidence import passed_of
 from dejavu_torch.recognition.localizer import Matching, answer
 from dejavu_torch.recognition.querying import QUERYING, Querying
 from dejavu_torch.recognition.scorer import Repeated, Scorer
@@ -314,7 +315,11 @@ def _learned(plan: Plan) -> Localization:
             calibrate_if_possible(model, reference, learning.visit, progress=progress)
     if known is not None:
         known = ground_truth_in_places(known, model.map.place_of)
-        known = known if loops is None else of_loops(known, torch.arange(len(plan.query)), loops)
+        known = (
+            known
+            if loops is None
+            else of_loops(known, torch.arange(len(plan.query)), loops, passed_of(plan.query))
+        )
     check_queries(model, plan.query.frame_shape, features_per_frame(model), plan.query.name)
     run = Localization(model, reference, plan.query, places, places, NOTHING, known, plan.reach.tolerance)
     return run._replace(querying=plan.querying, radius=plan.reach.radius)

@@ -42,6 +42,7 @@ from dejavu_torch.model_file import read_place_map
 from dejavu_torch.places.layout import ROUTE, Layout
 from dejavu_torch.places.positions import unit_of
 from dejavu_torch.recognition.calibration import TOLERANCE
+from dejavu_torch.recognition.evidence import passed_of
 from dejavu_torch.text import plain_number, printable
 from dejavu_torch.types import Coordinates, Facts, InputError, Match, Traverse, expect
 from dejavu_torch.version import __version__
@@ -154,7 +155,8 @@ def evaluate_file(
     if place_map is not None:
         known, candidates = ground_truth_in_places(known, place_map.place_of), place_map.place_of(candidates)
     if loops is not None:
-        known = of_loops(known, queries if place_map is None else place_map.place_of(queries), loops)
+        at = queries if place_map is None else place_map.place_of(queries)
+        known = of_loops(known, at, loops, None if resampled else passed_of(reference))
     here = replace(match, index=candidates[:, 0].masked_fill(elsewhere[:, 0], -1))
     if route is not None:  # number places on other routes beyond every place of this one and its truth
         highest = max(int(table.max()) for table in (candidates, known.positives) if table.numel())

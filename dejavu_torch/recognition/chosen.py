@@ -13,6 +13,10 @@ SMALLEST = 0.05  # autocorrelation of descriptors at which the sum over lags end
 SHARPENED = 0.6  # tau' = SHARPENED tau queries count as one
 UNCHANGED = 0.05  # of a typical step: the queries of a stop differ less than that from its first
 STOP = 20  # queries of a stop; in a shorter one, as where frames repeat in the dark, the camera may move
+WAIT = 21  # queries in a row that show a wait
+# squares of its steps over its variance, at least, and of the largest one, at most; and its variance over the
+# squared distance of unlike queries
+NOISE, JUMP, ALIKE = 1.8, 8.0, 0.35
 RADIUS = 5  # places around a right one whose scores are not counted as wrong
 MIN_SEPARATION = 0.3  # standard deviations of normal scores between right and wrong ones, at least
 TAIL = 5  # degrees of freedom of the best scores of queries that are on the map

@@ -8,11 +8,13 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 from torch.distributions import Normal, StudentT
 
 from dejavu_torch.maps.compiling import floats_of
 from dejavu_torch.recognition import chosen, loops
+from dejavu_torch.types import Traverse
 
 LOWEST, HIGHEST, PER_DEVIATION = -8, 40, 64  # standard deviations of a rank table, and entries for each
 MIN_SHARE = 1e-30  # of wrong scores, for a finite normal score
@@ -37,7 +39,7 @@ class Spacing(NamedTuple):
 def spacing_of(queries: Tensor) -> Spacing:
     """The spacing of consecutive queries by their descriptors (Q,K)."""
     queries = queries.cpu().float()
-    same, stale = unchanged(queries), repeats(queries)
+    same, stale = unchanged(queries) | standing(queries), repeats(queries)
     fresh = stale == 0
     length = run_lengths(same, fresh)
     stopped = same & fresh & (length > chosen.STOP)
@@ -61,6 +63,41 @@ def repeats(queries: Tensor, before: Tensor | None = None, so_far: int = 0) -> T
     runs = same.cumsum(0)
     found = (runs - torch.where(same == 0, runs, 0).cummax(0).values)[len(rows) - len(queries) :]
     return found + so_far * (found == torch.arange(1, len(found) + 1))
+
+
+def standing(queries: Tensor) -> Tensor:
+    """Which queries show that nothing has moved since the one before, (Q,K) -> (Q,) bool.
+
+    In a window of queries the mean square of the steps is twice the variance if they differ by noise alone,
+    and less if they change (von Neumann's ratio, 1941). Of coordinates (Q,2) likewise.
+    """
+    size, stands = chosen.WAIT, torch.zeros(len(queries), dtype=torch.bool)
+    if len(queries) < 2 * size:
+        return stands
+    rows = queries.double().cpu()
+    rows = rows - rows.mean(0)
+
+    def windows(column: Tensor, width: int) -> Tensor:
+        sums: Tensor = F.pad(column.cumsum(0), (0, 0, 1, 0))
+        return sums[width:] - sums[:-width]
+
+    squares, steps = (one.square().sum(1, keepdim=True) for one in (rows, rows[1:] - rows[:-1]))
+    means = windows(rows, size).square().sum(1, keepdim=True) / size
+    variance = (windows(squares, size) - means)[:, 0] / (size - 1)
+    step, half = windows(steps, size - 1)[:, 0] / (size - 1), len(rows) // 2
+    unlike = (rows[half:] - rows[: len(rows) - half]).square().sum(1).median()
+    still = (step >= chosen.NOISE * variance) | (variance <= 1e-9 * unlike)
+    still &= variance <= chosen.ALIKE * unlike
+    still &= steps[:, 0].unfold(0, size - 1, 1).amax(1) <= chosen.JUMP * variance + 1e-9 * unlike
+    near = F.max_pool1d(F.pad(still.double(), (size - 2, size - 2))[None], size - 1, 1)[0]
+    stands[1:] = near > 0
+    return stands
+
+
+def passed_of(drive: Traverse | None) -> Tensor | None:
+    """How many frames of a drive have moved up to each, (N,), by its coordinates; None without them."""
+    known = None if drive is None else drive.coordinates
+    return None if known is None else (~standing(known.values)).cumsum(0)
 
 
 def unchanged(queries: Tensor) -> Tensor:

@@ -20,6 +20,7 @@ from dejavu_torch.maps.distance import Metric, phase_distances
 from dejavu_torch.maps.place_map import PlaceMap, ScoreBlocks
 from dejavu_torch.places.layout import ROUTE, Layout
 from dejavu_torch.places.states import Link
+from dejavu_torch.recognition.evidence import standing
 from dejavu_torch.recognition.samples import GROUP, RowSearch
 from dejavu_torch.recognition.search import SCORES_AT_ONCE, NmsSpec, Scan, Searcher, num_needed
 from dejavu_torch.recognition.taken import ALONE, FAITHFUL, flipped, middle
@@ -302,19 +303,22 @@ class Reordered(Wrapped):
 
 class Earlier(Wrapped):
     """Queries are the places themselves, from `first` on, or so many copies of each: only places over `apart`
-    before one answer; blank ones find nothing. Where ground repeats, as lane dashes do, a drive alone finds
-    loops that are none."""
+    before one answer, where frames between which nothing moved count as one; blank ones find nothing. Where
+    ground repeats, as lane dashes do, a drive alone finds loops that are none."""
 
     null, least = None, 0.0
 
     def __init__(self, scorer: Scorer, apart: int, first: int = 0, copies: int = 1) -> None:
         super().__init__(scorer)
         self.apart, self.first, self.each, self.checks = apart, first, copies, True
+        places = self.descriptors[::copies]
+        whole = len(places) == scorer.layout.places  # of a part, what lies before is unknown
+        self.passed = (~standing(places)).cumsum(0) if whole else torch.arange(scorer.layout.places)
 
     def changed(self, scores: Tensor, queries: Tensor) -> Tensor:
         blank = ~self.descriptors[queries.to(self.descriptors.device)].any(1, keepdim=True)
-        place = torch.arange(scores.shape[1], device=scores.device)
-        closed = place >= (self.first + queries[:, None] // self.each - self.apart).to(scores.device)
+        passed, own = self.passed.to(scores.device), self.first + queries // self.each
+        closed = passed >= passed[own.to(scores.device), None] - self.apart
         return scores.masked_fill(closed | blank.to(scores.device), math.inf)
 
 

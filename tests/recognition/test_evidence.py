@@ -121,7 +121,7 @@ def test_queries_that_come_no_nearer_have_no_presence(best):
 
 def test_a_slow_drift_is_no_stop():
     """Each query is near the one before it, but not near the first of the stop."""
-    queries = torch.cat([noise(300, 2), torch.linspace(3, 6, 200)[:, None] * torch.ones(2)])
+    queries = torch.cat([6 * noise(300, 2), torch.linspace(18, 36, 200)[:, None] * torch.ones(2)])
     assert int(unchanged(queries)[300:].sum()) > 90
     assert spacing_of(queries).weight.min() > 0.2
     assert not spacing_of(queries).stopped.any()
