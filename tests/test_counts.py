@@ -86,7 +86,7 @@ RUNS = {  # searched, scored, moved, described
     "filter": (localized(PlaceFilter), (1300, 250, 150, 451)),
     "drive": (localized(PlaceSmoother), (1300, 1152, 1192, 451)),
     "compare": (compared(*ROUTE, "0"), (1450, 3104, 12678, 903)),
-    "compare of an area": (compared(*AREA, None), (58, 1576, 9608, 765)),
+    "compare of an area": (compared(*AREA, None), (58, 1400, 9608, 765)),
 }
 
 

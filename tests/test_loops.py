@@ -90,7 +90,7 @@ def test_a_wait_is_no_loop(noise, drive):
 )
 def test_what_moves_or_is_short_is_no_wait(queries):
     assert not standing(queries).any()
-    assert not standing(torch.randn(200, 6).cumsum(0)).any()
+    assert not standing(torch.randn(200, 64).cumsum(0)).any()
     assert not standing(torch.full((200, 2), torch.nan)).any()
 
 

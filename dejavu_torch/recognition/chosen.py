@@ -16,7 +16,7 @@ STOP = 20  # queries of a stop; in a shorter one, as where frames repeat in the 
 WAIT = 21  # queries in a row that show a wait
 # squares of its steps over its variance, at least, and of the largest one, at most; and its variance over the
 # squared distance of unlike queries
-NOISE, JUMP, ALIKE = 1.8, 8.0, 0.35
+NOISE, JUMP, ALIKE = 1.9, 8.0, 0.35
 RADIUS = 5  # places around a right one whose scores are not counted as wrong
 MIN_SEPARATION = 0.3  # standard deviations of normal scores between right and wrong ones, at least
 TAIL = 5  # degrees of freedom of the best scores of queries that are on the map

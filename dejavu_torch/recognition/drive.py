@@ -252,8 +252,7 @@ def _of_windows(asked: DriveQuery, progress: bool) -> Iterator[tuple[DriveQuery,
     scorer, places = asked.scorer, asked.scorer.layout.places
     drive = LargeDrive(scorer, asked.smoother, max(2, asked.k), asked.radius, progress)
     asked = asked.fitted(drive.smoother, drive.spacing)
-    drive.smoother = asked.smoother  # which knows what single images say
-    for first, mass, scores, known in drive:
+    for first, mass, scores, known in drive.masses(asked.smoother):
         if asked.answers:
             yield asked, Seen(mass, scores, known)
             continue

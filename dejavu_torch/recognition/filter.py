@@ -259,8 +259,9 @@ class PlaceFilter(SequenceModel):
         places = scores.shape[1]
         if not isinstance(state, FilterState):
             raise InputError(f"the state is a {type(state).__name__}; expected that of `start` or of a step")
-        known = self.layout.places or places
-        expect(places == known, f"those of the map's {known} places", f"scores are {tuple(scores.shape)}")
+        if self.layout.places and self.layout.places != places:
+            own = f"those of the map's {self.layout.places} places"
+            raise InputError(f"scores are {tuple(scores.shape)}; expected {own}")
         if state.belief.shape != (places + 1,):
             shapes = f"the posterior is {tuple(state.belief.shape)}; expected {(places + 1,)}"
             raise InputError(f"{shapes} for this map")

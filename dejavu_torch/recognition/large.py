@@ -225,31 +225,33 @@ class LargeDrive:
         samples = []
         for i, length in self._fitted().items():
             window = self.windows[i]
-            sample = self._sample(window, slice(window.first, window.first + length))
+            sample = self._sample(window, slice(window.first, window.first + length), self.smoother)
             std = sample.std
             ranks.add(std.z, std.only((sample.weight * std.speaks)[:, None].expand_as(std.z), 0))
             samples.append(sample)
         return self.smoother.taught(samples, ranks, self.spacing, self.means)
 
-    def _sample(self, window: Window, some: slice) -> FittedPart:
+    def _sample(self, window: Window, some: slice, smoother: PlaceSmoother) -> FittedPart:
         z = window.z[some.start - window.start : some.stop - window.start].float()
         speaks, states = self.speaks[some] > 0, self.states.of(window.places)
-        singly = self.smoother.singly
+        singly = smoother.singly
         absent = singly and singly.presence and singly.presence.absent(self.best[some])
         holes = self.means[window.places].isinf().expand_as(z)
         valid = z.isfinite() | ~speaks[:, None]
         std = Standardised(z.nan_to_num(0, 0, 0), speaks, valid, absent, holes if holes.any() else None)
-        over = partial(self.smoother.motion, states)
+        over = partial(smoother.motion, states)
         return FittedPart(std, self.spacing.weight[some], self.spacing.stopped[some], over)
 
     @torch.no_grad()
-    def __iter__(self) -> Iterator[tuple[int, Tensor, Tensor, Tensor]]:
-        """The first query of each window, the last window first; the mass and scores (B,n) of some places
-        (n,)."""
-        smoother = self.smoother
+    def masses(self, smoother: PlaceSmoother) -> Iterator[tuple[int, Tensor, Tensor, Tensor]]:
+        """The first query of each window, the last window first; mass and scores (B,n) of some places (n,).
+
+        Args:
+            smoother: that of the drive, which may know what single images say.
+        """
         rates = smoother.rates(self.means)
         for window in self.windows[::-1]:
-            sample = self._sample(window, slice(window.start, window.stop))
+            sample = self._sample(window, slice(window.start, window.stop), smoother)
             evidence = Evidence(smoother.values, smoother.separation, smoother.tempering)
             (block,) = explained(sample, evidence, sample.over(rates), len(sample.weight))
             own = slice(window.first - window.start, window.last - window.start)

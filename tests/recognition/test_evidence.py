@@ -6,6 +6,7 @@ import math
 
 import pytest
 import torch
+import torch.nn.functional as F
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -121,7 +122,9 @@ def test_queries_that_come_no_nearer_have_no_presence(best):
 
 def test_a_slow_drift_is_no_stop():
     """Each query is near the one before it, but not near the first of the stop."""
-    queries = torch.cat([6 * noise(300, 2), torch.linspace(18, 36, 200)[:, None] * torch.ones(2)])
+    turn = torch.linspace(0, 4, 200)
+    drift = F.pad(20 * torch.stack([turn.cos(), turn.sin()], 1), (0, 62))
+    queries = torch.cat([3 * noise(300, 64), drift])
     assert int(unchanged(queries)[300:].sum()) > 90
     assert spacing_of(queries).weight.min() > 0.2
     assert not spacing_of(queries).stopped.any()

@@ -115,7 +115,7 @@ def test_no_drive_looks_at_more_places_than_it_may(kind, monkeypatch):
     drive = LargeDrive(by_rows(scores, noise(300, 8)), PlaceSmoother(), candidates=4, radius=10**4)
     assert not drive.smoother.is_drive
     assert all(0 < len(window.places) <= 3 * 320 for window in drive.windows)
-    assert [len(own) for _, own, *_ in drive] == [100, 100, 100]
+    assert [len(own) for _, own, *_ in drive.masses(drive.smoother)] == [100, 100, 100]
 
 
 def test_a_drive_is_fitted_to_no_more_queries_than_it_may():
@@ -129,7 +129,7 @@ def test_a_drive_is_fitted_to_no_more_queries_than_it_may():
 def test_scores_of_windows_are_those_that_were_given(monkeypatch):
     scores = shown(300, range(20, 280))
     drive = LargeDrive(by_rows(scores, noise(260, 8)), PlaceSmoother())
-    for first, mass, own, places in drive:
+    for first, mass, own, places in drive.masses(drive.smoother):
         assert bool((mass >= 0).all() and (mass.sum(1) <= 1 + 1e-5).all() and (mass.amax(1) > 0.1).all())
         assert torch.allclose(own, scores[first : first + len(own)][:, places], atol=0.01)
 
@@ -212,4 +212,4 @@ def test_large_maps_and_long_drives_are_large():
 def test_a_prior_of_a_camera_that_is_very_fast():
     scores = shown(700, range(20, 680, 20))
     drive = LargeDrive(by_rows(scores, noise(33, 8)), PlaceSmoother((0,) * 20 + (1.0,)))
-    assert sum(len(own) for _, _, own, _ in drive) == 33
+    assert sum(len(own) for _, _, own, _ in drive.masses(drive.smoother)) == 33
