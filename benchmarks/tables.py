@@ -18,6 +18,7 @@ from typing import Any
 
 from benchmarks.alike import CAPPED, CHECKED, PRECISIONS, SINGLE, UNCAPPED
 from benchmarks.areas import NAMES as AREA_WAYS
+from benchmarks.cross import WAYS as ANSWERED
 from benchmarks.cross import summary
 from benchmarks.files import NAMES as FILES
 from benchmarks.headings import NAMES as HEADING_WAYS
@@ -442,6 +443,37 @@ def cross() -> str:
     return markdown(summary([row | {"skipped": row.get("skipped")} for row in read("cross")["rows"]]))
 
 
+def left() -> str:
+    """Drives that leave the map, stand still, or see it otherwise: the mean and the worst route."""
+    rows = read("ends")["rows"]
+    kinds = by("contender", [row for row in rows if "taken" in row])
+    head = [f"{way}: {what}" for way in ANSWERED for what in ("off", "on", "wrong")]
+    table = [["drive", "routes", *head]]
+    for kind, own in kinds.items():
+        cells = [kind, str(len(own))]
+        for way in ANSWERED:
+            for key, worst in ((f"{way}_off_0.5", max), (f"{way}_on_0.5", min), (f"{way}_on_wrong", max)):
+                known = [row[key] for row in own if row.get(key) is not None]
+                cells.append(f"{area(mean(known))} {area(worst(known))}" if known else "")
+        table.append(cells)
+    waits = by("contender", [row for row in rows if "loops_in_wait" in row])
+    loops = [["loops within", "routes", "accepted"]]
+    for kind, own in waits.items():
+        loops.append([kind, str(len(own)), str(sum(row["loops_in_wait"] for row in own))])
+    return f"{markdown(table)}\n{markdown(loops)}"
+
+
+def constants() -> str:
+    """What other values of the constants of evidence and fit do to whole drives."""
+    table = [["constant", "AUC", "most lost", "on", "calibration error", "another route, p > .5"]]
+    for row in read("chosen")["rows"]:
+        lost = f"{row['lost']:.3f}" if row["lost"] > 0.0005 else ""
+        figures = (row["auc"], row["calibration_error"], row["elsewhere"])
+        auc, error, other = (f"{figure:.3f}" for figure in figures)
+        table.append([row["contender"], auc, lost, row["lost_by"] if lost else "", error, other])
+    return markdown(table)
+
+
 def large_drives() -> str:
     """Time and memory of drives on large maps, and what they find."""
     table = [["queries, places, B per place", "one image", "whole drive", "at all places", "s", "MB"]]
@@ -626,7 +658,7 @@ TABLES: dict[str, Callable[[], str]] = {
     **{"descriptors": descriptors, "sequences": sequences},
     **{"rejection": rejection, "filtered": filtered, "drives": drives, "driven": driven},
     **{"trainings": trainings, "made drives": made_drives, "storage drives": storage_drives},
-    "cross": cross,
+    **{"cross": cross, "ends": left, "chosen": constants},
     **{
         "areas": areas,
         "headings": headings,

@@ -10,7 +10,7 @@ import torch
 from command_line import benchmark
 from torch.nn.functional import normalize
 
-from benchmarks import chosen, cross, drives, large_drives, storage_drives, tables
+from benchmarks import chosen, cross, drives, ends, large_drives, storage_drives, tables
 from benchmarks.drives import AS_IT_WAS, ELSEWHERE, HALF, NO_OTHER, bench_drives, drives_of
 from benchmarks.storage_drives import ANSWERS, Asked, bench_storage_drives, both_sides, drive_table
 from benchmarks.trainings import Route
@@ -166,3 +166,40 @@ def test_other_constants_are_tried_and_put_back(tmp_path, monkeypatch, capsys):
     assert len({row["auc"] for row in rows}) > 1
     assert vars(constants) == before
     assert "ROUNDS 5: 10" in capsys.readouterr().out
+
+
+def test_drives_leave_the_map_stand_still_and_see_it_otherwise(tmp_path, monkeypatch, capsys):
+    for name, seed in {"a": 0, "b": 1}.items():
+        images = pictures(seed)
+        np.save(tmp_path / f"{name}.npy", images)
+    footage = cross.Footage("{data}/a.npy", "{data}/b.npy", 2, "0", "walk", "walk")
+    monkeypatch.setattr(ends, "FOOTAGE", {"walk": footage})
+    monkeypatch.setattr(ends, "SEES", {"walk": 3})
+    monkeypatch.setattr(ends, "HOLE", 20)
+    benchmark("ends", tmp_path, "--out", tmp_path / "out")
+    rows = {
+        row["contender"]: row for row in json.loads((tmp_path / "out" / "bench.json").read_text())["rows"]
+    }
+    whole, cut, hole = (rows[name] for name in ("as it is", "end cut, 33%", "a hole of 40"))
+    assert (whole["on"], whole["off"], whole["taken"]) == (PLACES, 0, True)
+    assert whole["drive_on_0.5"] > 0.9
+    assert (cut["on"], cut["shared"], cut["off"]) == (80, 3, 37)
+    assert cut["drive_off_0.5"] < 0.1
+    assert cut["drive_on_0.5"] > 0.8
+    assert hole["on"] == PLACES - 20
+    assert rows["stalls of 20"]["drive_on_wrong"] < 0.1
+    assert {"a lens of 1.2", "a wait", "a wait with noise"} <= rows.keys()
+    assert rows["a wait"]["loops_in_wait"] == rows["a wait with noise"]["loops_in_wait"] == 0
+    assert "loops within a wait, at most: 0" in capsys.readouterr().out
+    monkeypatch.setattr(tables, "read", lambda _: {"rows": [*rows.values()]})
+    assert "| end cut, 33% | 1 |" in tables.left()
+
+
+def pictures(seed):
+    """A walk past random ground, 120 pictures of 24 x 24, with noise of this seed."""
+    ground = torch.rand(1, 1, 24, 6 * PLACES, generator=torch.Generator().manual_seed(7))
+    ground = torch.nn.functional.avg_pool2d(ground, 3, 1, 1)[0, 0]
+    frames = torch.stack([ground[:, 6 * i : 6 * i + 24] for i in range(PLACES - 3)])
+    frames = torch.cat([frames, frames[-3:].flip(2)])
+    noise = torch.rand(frames.shape, generator=torch.Generator().manual_seed(seed))
+    return (220 * frames + 30 * noise).byte().numpy()
