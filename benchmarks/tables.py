@@ -445,7 +445,7 @@ def cross() -> str:
 
 def left() -> str:
     """Drives that leave the map, stand still, or see it otherwise: the mean and the worst route."""
-    rows = read("ends")["rows"]
+    rows = [row | {"skipped": row.get("skipped")} for row in read("ends")["rows"]]
     kinds = by("contender", [row for row in rows if "taken" in row])
     head = [f"{way}: {what}" for way in ANSWERED for what in ("off", "on", "wrong")]
     table = [["drive", "routes", *head]]
