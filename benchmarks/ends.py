@@ -135,8 +135,8 @@ def cases(name: str, data: Path) -> Iterator[Case]:
 
 
 def waits(name: str, data: Path) -> Iterator[Row]:
-    """Loops that are accepted within a wait of a drive that has none: the first frames of a route, of which
-    one is there `WAITS` times, by the same picture or with noise of one grey level in 255."""
+    """Loops that are accepted within a wait: among the first frames of a route, one is there `WAITS` times,
+    by the same picture or with noise of one grey level in 255."""
     reference, _, _ = traverses(FOOTAGE[name], data)
     frames = reference[:WAITED]
     half = len(frames) // 2
@@ -150,7 +150,8 @@ def waits(name: str, data: Path) -> Iterator[Row]:
         model = DejaVu().learn(drive)
         match = model.loops(drive, LOOPS)
         title = "a wait" if not noise else "a wait with noise"
-        accepted = int(match.accepted[half : half + WAITS].sum())
+        some = slice(half, half + WAITS)
+        accepted = int((match.accepted[some] & (match.index[some] >= half)).sum())
         yield {"case": name, "contender": title, "queries": len(drive), "loops_in_wait": accepted}
 
 

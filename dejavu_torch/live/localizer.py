@@ -67,7 +67,8 @@ class LiveLocalizer:
         scores: (N,) of the latest answer, on the model's device; None before the first, or if not kept.
 
     Convention: the answers equal those of `DejaVu.localize` up to rounding; without a sequence, the first 100
-        of a drive know no views yet. A refused frame changes nothing.
+        of a drive know no views yet, and probabilities fall while a picture repeats. A refused frame changes
+        nothing.
         `left_out` in `localizer(frame, left_out)` is the number of frames skipped before this one: a
         `PlaceFilter` moves once more for each. With a `PlaceFilter` that has a lag, `due(frame, left_out)`
         gives the answers that this frame completes, none or one, in the order of the frames, and `finish()`
@@ -135,7 +136,7 @@ class LiveLocalizer:
             return self._due(frame, left_out)
 
     def _due(self, frame: Tensor | np.ndarray, left_out: int) -> list[LiveMatch]:
-        start, mean = time.perf_counter(), self._mean
+        start, mean, latest = time.perf_counter(), self._mean, self._latest
         batch = as_batch(frame, self.model.map.device)
         with in_one_thread(batch.numel() if self._small else math.inf):
             descriptor = self._describe(batch)
@@ -146,11 +147,11 @@ class LiveLocalizer:
                 descriptor, mean = self._latest[1], self._mean  # a picture that repeats counts once
             else:
                 raw, (descriptor, mean) = descriptor, self.centring(descriptor, mean, len(descriptor))
-                self._latest = raw, descriptor
+                latest = raw, descriptor
         with in_one_thread(self.model.map.places):
             self._localizer.skip(min(left_out, MAX_SKIPPED))
             match = self._localizer(descriptor)
-        self._mean = mean
+        self._mean, self._latest = mean, latest
         return self._told(match, start)
 
     @torch.no_grad()

@@ -13,6 +13,7 @@ SMALLEST = 0.05  # autocorrelation of descriptors at which the sum over lags end
 SHARPENED = 0.6  # tau' = SHARPENED tau queries count as one
 UNCHANGED = 0.05  # of a typical step: the queries of a stop differ less than that from its first
 STOP = 20  # queries of a stop; in a shorter one, as where frames repeat in the dark, the camera may move
+ROUNDING = 1e-5  # of a descriptor, by which those of one picture differ in other batches
 WAIT = 21  # queries in a row that show a wait
 # squares of its steps over its variance, at least, and of the largest one, at most; and its variance over the
 # squared distance of unlike queries

@@ -47,8 +47,8 @@ def spacing_of(queries: Tensor) -> Spacing:
 
 
 def repeats(queries: Tensor, before: Tensor | None = None, so_far: int = 0) -> Tensor:
-    """How many queries in a row, up to each, repeat the picture of the one before, as of a stream that has
-    stalled: (Q,K) -> (Q,) int64. Those of 0, as of dark frames, show no picture.
+    """How many queries in a row, up to each, repeat the picture of the one before but for rounding, as of a
+    stream that has stalled: (Q,K) -> (Q,) int64. Those of 0, as of dark frames, show no picture.
 
     Args:
         before: (K,), the query before the first. so_far: how many, up to that one.
@@ -59,7 +59,8 @@ def repeats(queries: Tensor, before: Tensor | None = None, so_far: int = 0) -> T
     """
     rows = queries if before is None else torch.cat([before[None].to(queries), queries])
     same = torch.zeros(len(rows), dtype=torch.int64)
-    same[1:] = ((rows[1:] == rows[:-1]).all(1) & rows[1:].any(1)).cpu()
+    steps, sizes = (rows[1:] - rows[:-1]).norm(dim=1), rows[1:].norm(dim=1)
+    same[1:] = ((steps <= chosen.ROUNDING * sizes) & (sizes > 0)).cpu()
     runs = same.cumsum(0)
     found = (runs - torch.where(same == 0, runs, 0).cummax(0).values)[len(rows) - len(queries) :]
     return found + so_far * (found == torch.arange(1, len(found) + 1))
@@ -71,33 +72,50 @@ def standing(queries: Tensor) -> Tensor:
     In a window of queries the mean square of the steps is twice the variance if they differ by noise alone,
     and less if they change (von Neumann's ratio, 1941). Of coordinates (Q,2) likewise.
     """
-    size, stands = chosen.WAIT, torch.zeros(len(queries), dtype=torch.bool)
-    if len(queries) < 2 * size:
+    size, count = chosen.WAIT, len(queries)
+    stands = torch.zeros(count, dtype=torch.bool)
+    if count < 2 * size:
         return stands
-    rows = queries.double().cpu()
-    rows = rows - rows.mean(0)
 
     def windows(column: Tensor, width: int) -> Tensor:
         sums: Tensor = F.pad(column.cumsum(0), (0, 0, 1, 0))
         return sums[width:] - sums[:-width]
 
-    squares, steps = (one.square().sum(1, keepdim=True) for one in (rows, rows[1:] - rows[:-1]))
-    means = windows(rows, size).square().sum(1, keepdim=True) / size
-    variance = (windows(squares, size) - means)[:, 0] / (size - 1)
-    step, half = windows(steps, size - 1)[:, 0] / (size - 1), len(rows) // 2
-    unlike = (rows[half:] - rows[: len(rows) - half]).square().sum(1).median()
-    still = (step >= chosen.NOISE * variance) | (variance <= 1e-9 * unlike)
-    still &= variance <= chosen.ALIKE * unlike
-    still &= steps[:, 0].unfold(0, size - 1, 1).amax(1) <= chosen.JUMP * variance + 1e-9 * unlike
+    lost = queries.isnan().any(1).cpu()
+    variance = torch.zeros(count - size + 1).double()
+    steps, apart = torch.zeros(count - 1).double(), [count // 2, count // 3]
+    unlike = [torch.zeros(count - lag).double() for lag in apart]
+    for part in queries.split(COLUMNS, 1):
+        rows = part.double().cpu()
+        rows = (rows - rows.nanmean(0)).nan_to_num(0)
+        squares = windows(rows.square(), size) - windows(rows, size).square() / size
+        variance += squares.sum(1) / (size - 1)
+        steps += (rows[1:] - rows[:-1]).square().sum(1)
+        for total, lag in zip(unlike, apart, strict=True):
+            total += (rows[lag:] - rows[:-lag]).square().sum(1)
+    step = windows(steps[:, None], size - 1)[:, 0] / (size - 1)
+    far = max(total.median() for total in unlike)  # laps of one length are alike half a drive apart
+    still = (step >= chosen.NOISE * variance) | (variance <= 1e-9 * far)
+    still &= (variance <= chosen.ALIKE * far) & (windows(lost[:, None].double(), size)[:, 0] == 0)
+    still &= steps.unfold(0, size - 1, 1).amax(1) <= chosen.JUMP * variance + 1e-9 * far
     near = F.max_pool1d(F.pad(still.double(), (size - 2, size - 2))[None], size - 1, 1)[0]
     stands[1:] = near > 0
     return stands
 
 
 def passed_of(drive: Traverse | None) -> Tensor | None:
-    """How many frames of a drive have moved up to each, (N,), by its coordinates; None without them."""
-    known = None if drive is None else drive.coordinates
-    return None if known is None else (~standing(known.values)).cumsum(0)
+    """How many frames of a drive have moved up to each, (N,), by its coordinates; None without them. A fix
+    that is held for some frames, as of a receiver slower than the camera, is no wait."""
+    if drive is None or drive.coordinates is None:
+        return None
+    fixes, run, length = drive.coordinates.values.unique_consecutive(
+        dim=0, return_inverse=True, return_counts=True
+    )
+    waits = standing(fixes) | (length > max(chosen.WAIT, 3 * int(length.median())))
+    first = F.pad(run[1:] != run[:-1], (1, 0), value=True)
+    held = ~first & ~waits[run]  # the camera goes on
+    passed: Tensor = (held | (first & ~standing(fixes)[run])).cumsum(0)
+    return passed
 
 
 def unchanged(queries: Tensor) -> Tensor:
@@ -237,7 +255,8 @@ def presence_of(best: Tensor, null: Tensor) -> Presence | None:
 
 def standardised(scores: Tensor, means: Tensor, presence: Presence | None = None) -> Standardised:
     """Scores (Q,N) without the means (N,) of the places."""
-    speaks, centred, valid = speaking(scores), scores - means, None
+    speaks, valid, known = speaking(scores), None, means.isfinite()
+    centred = scores - (means if bool(known.all()) else means.where(known, 0))
     count = torch.full_like(scores[:, :1], scores.shape[1])
     if not all_finite(scores):
         valid = scores.isfinite()
@@ -249,8 +268,7 @@ def standardised(scores: Tensor, means: Tensor, presence: Presence | None = None
     speaks = speaks & (spread[:, 0] > MIN_SHARE)
     z = centred / torch.where(speaks[:, None], spread, 1)
     absent = None if presence is None else presence.absent(scores.amin(1))
-    holes = None if valid is None else ~means.isfinite()
-    holes = holes.expand_as(z) if holes is not None and holes.any() and not holes.all() else None
+    holes = None if valid is None or known.all() or not known.any() else ~known & ~valid
     return Standardised(z, speaks, None if valid is None else valid | ~speaks[:, None], absent, holes)
 
 

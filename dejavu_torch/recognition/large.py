@@ -118,7 +118,8 @@ class LargeDrive:
             for start, scores in blocks:
                 stop = start + scores.shape[1]
                 least, most = scores.aminmax(dim=1)
-                known = worse = scores - self.means[start:stop]
+                means = self.means[start:stop]
+                known = worse = scores - means.where(means.isfinite(), 0)
                 count += scores.shape[1]
                 if not bool((most - least).isfinite().all()):  # seldom, and slower
                     valid = scores.isfinite()
@@ -207,7 +208,8 @@ class LargeDrive:
     def _z(self, scores: Tensor, begin: int, at: int, some: slice, places: Tensor) -> Tensor:
         """z of some queries at some places; scores are those from query `begin` and place `at` on."""
         own = scores[some.start - begin : some.stop - begin, places - at]
-        better = self.means[places] - own + self.mean[some, None]
+        means = self.means[places]
+        better = means.where(means.isfinite(), 0) - own + self.mean[some, None]
         z: Tensor = better / self.spread[some, None]
         return z
 
@@ -236,7 +238,7 @@ class LargeDrive:
         speaks, states = self.speaks[some] > 0, self.states.of(window.places)
         singly = smoother.singly
         absent = singly and singly.presence and singly.presence.absent(self.best[some])
-        holes = self.means[window.places].isinf().expand_as(z)
+        holes = self.means[window.places].isinf() & ~z.isfinite()
         valid = z.isfinite() | ~speaks[:, None]
         std = Standardised(z.nan_to_num(0, 0, 0), speaks, valid, absent, holes if holes.any() else None)
         over = partial(smoother.motion, states)

@@ -33,7 +33,7 @@ from dejavu_torch.recognition.taken import (
 )
 from dejavu_torch.recognition.views import Views
 from dejavu_torch.text import with_progress
-from dejavu_torch.types import Match, SequenceModel, State, Together, expect
+from dejavu_torch.types import Match, SequenceModel, State, Together, check_shape, expect
 
 CACHED = 2**20  # scores processed at a time: they stay in the cache
 
@@ -132,7 +132,9 @@ class Localizer:
         """Match the next queries, which are those of a scorer, or all copies of them, see `wrapped`."""
         scorer, k, radius = wrapped(scorer, self.matching), self.matching.k or 1, self.matching.radius
         if not len(scorer):
-            return self.match(torch.zeros(0, max(1, self.layout.places)))
+            return self._with_stale(self.match(torch.zeros(0, max(1, self.layout.places))))
+        if self.last is not None:
+            check_shape(scorer.descriptors, f"B {len(self.last)}", "the queries are")
         wanted = [(k, radius), (min(2, self.layout.places), TOLERANCE)]
         if self.models or self.matching.callback is not None:  # they need all scores
             wanted = []
@@ -236,7 +238,7 @@ class Localizer:
         """The answers that a `PlaceFilter` with a lag still owes, after the last query; else none."""
         places = max(1, self.layout.places)
         if self.matching.sequence is None or not self.matching.sequence.lag or not self.states:
-            return self.match(torch.zeros(0, places))
+            return self._with_stale(self.match(torch.zeros(0, places)))
         owed = self.matching.sequence.waiting(self.states[self.own])
         match = self._with_stale(self._in_sequence(owed[:0], last=True))
         return self._doubted(match, torch.tensor(self.running.odds)) if len(self.alone) else match

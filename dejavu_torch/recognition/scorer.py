@@ -313,7 +313,8 @@ class Earlier(Wrapped):
         self.apart, self.first, self.each, self.checks = apart, first, copies, True
         places = self.descriptors[::copies]
         whole = len(places) == scorer.layout.places  # of a part, what lies before is unknown
-        self.passed = (~standing(places)).cumsum(0) if whole else torch.arange(scorer.layout.places)
+        waits = standing(places) & places.any(1).cpu()  # in the dark a camera may move
+        self.passed = (~waits).cumsum(0) if whole else torch.arange(scorer.layout.places)
 
     def changed(self, scores: Tensor, queries: Tensor) -> Tensor:
         blank = ~self.descriptors[queries.to(self.descriptors.device)].any(1, keepdim=True)

@@ -90,7 +90,7 @@ def test_equals_a_literal_loop_in_blocks_of_any_size(smoother, shape, size, two_
 def stopped():
     """33 queries, 22 of them of a stop."""
     moving = noise(12, 2, seed=4)
-    stop = moving[1:2].double() * (1 + 1e-5 * torch.arange(1, 22)[:, None])
+    stop = moving[1:2].double() * (1 + 5e-5 * (torch.arange(21)[:, None] % 2 - 2))
     return torch.cat([moving[:2].double(), stop, moving[2:].double()])
 
 
@@ -98,7 +98,7 @@ def test_a_stop_moves_nowhere_and_counts_once():
     smoother, scores = PlaceSmoother(MOVES, 0.1, 0.1, 0.1, 0.3).double(), stopped()
     log, still = evidence(smoother, scores)
     assert still.tolist() == [False] * 2 + [True] * 21 + [False] * 10
-    assert torch.allclose(log[1:23].sum(0), 22 * log[1])
+    assert torch.allclose(log[1:23].sum(0), 22 * log[1], rtol=0.01)
     steps = steps_of(smoother, 2)
     expected, total = forward_backward(steps, log.tolist(), still.tolist())
     states = torch.tensor(expected, dtype=torch.float64)
@@ -327,7 +327,7 @@ def test_other_precisions_give_the_same_places(dtype):
 
 def test_a_device_gives_what_the_cpu_gives():
     scores = shown(8, [*range(5), *[5] * 22], clear=3.0).double()
-    scores[5:] = scores[5] * (1 + 1e-5 * torch.arange(22)[:, None])
+    scores[5:] = scores[5] * (1 + 5e-5 * (torch.arange(22)[:, None] % 2))
     smoother = PlaceSmoother(MOVES).double().fit(scores)
     with pretend() as device:
         there = PlaceSmoother(MOVES).double().to(device).fit(scores.to(device))
