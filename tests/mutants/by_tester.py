@@ -614,8 +614,8 @@ MUTANTS = [
     Mutant(
         "No place is good for all queries: the mean of its scores is removed.",
         "dejavu_torch/recognition/evidence.py",
-        "scores - means, None",
-        "scores, None",
+        "centred = scores - (means if bool(known.all()) else means.where(known, 0))",
+        "centred = scores",
         ("tests/recognition/test_evidence.py::-k beside_those",),
     ),
     Mutant(
@@ -691,8 +691,8 @@ MUTANTS = [
     Mutant(
         "A frame finds no loop to itself, or to the frames just before it.",
         "dejavu_torch/recognition/scorer.py",
-        "closed = place >= (",
-        "closed = place > (",
+        "closed = passed >= passed",
+        "closed = passed > passed",
         ("tests/test_loops.py::-k second_lap",),
     ),
     Mutant(
@@ -1177,5 +1177,54 @@ MUTANTS = [
         "motion = first.motion(",
         "motion = AlongRoute(",
         ("tests/recognition/test_engine.py::-k as_it_is_told",),
+    ),
+    Mutant(
+        "How near a query comes tells whether it is off the map.",
+        "dejavu_torch/recognition/engine.py",
+        "log - std.absent[..., None] * shares",
+        "log",
+        ("tests/benchmarks/test_drives.py::-k otherwise", "tests/recognition"),
+    ),
+    Mutant(
+        "A camera passes places that no query has a score at.",
+        "dejavu_torch/recognition/engine.py",
+        "log.masked_fill(std.holes, 0)",
+        "log",
+        ("tests/recognition/test_smoother.py::-k hole",),
+    ),
+    Mutant(
+        "Places that a query sees are no hole for it.",
+        "dejavu_torch/recognition/evidence.py",
+        "else ~known & ~valid",
+        "else (~known).expand_as(z)",
+        ("tests/test_loops.py", "tests/recognition/test_smoother.py::-k hole"),
+    ),
+    Mutant(
+        "A picture that repeats tells a filter nothing.",
+        "dejavu_torch/recognition/localizer.py",
+        "if bool(again.any()):",
+        "if False:",
+        ("tests/benchmarks/test_drives.py::-k otherwise", "tests/live"),
+    ),
+    Mutant(
+        "A picture that repeats says nothing of a drive.",
+        "dejavu_torch/recognition/evidence.py",
+        "return Spacing(fresh / length,",
+        "return Spacing(1 / length,",
+        ("tests/recognition/test_evidence.py::-k stale",),
+    ),
+    Mutant(
+        "Frames between which nothing moves count as one, in loops.",
+        "dejavu_torch/recognition/scorer.py",
+        "(~waits).cumsum(0) if whole",
+        "torch.ones(len(places)).cumsum(0).long() if whole",
+        ("tests/test_loops.py::-k wait",),
+    ),
+    Mutant(
+        "A receiver slower than the camera does not stand.",
+        "dejavu_torch/recognition/evidence.py",
+        "length > max(chosen.WAIT, 3 * int(length.median()))",
+        "length > chosen.WAIT",
+        ("tests/test_loops.py::-k coordinates",),
     ),
 ]
