@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,8 +15,9 @@ from helpers import refused
 from dejavu_torch import DejaVu, PlaceFilter, open_source
 from dejavu_torch.data.ground_truth import as_ground_truth, of_loops
 from dejavu_torch.evaluation.compare import compare
-from dejavu_torch.recognition.evidence import standing
+from dejavu_torch.recognition.evidence import passed_of, standing
 from dejavu_torch.recognition.querying import Querying
+from dejavu_torch.types import Coordinates
 
 
 def twice(length=120):
@@ -83,6 +85,28 @@ def test_a_wait_is_no_loop(noise, drive):
         as_ground_truth([[0, 178, 190]] * 2), torch.tensor([200, 299]), 50, (~standing(where)).cumsum(0)
     )
     assert truth.positives.tolist() == [[0, -1, -1]] * 2
+
+
+def test_a_wait_is_seen_in_laps_and_where_some_coordinates_are_unknown():
+    path = 3 * torch.randn(200, 2, generator=torch.Generator().manual_seed(0)).cumsum(0)
+    wait = torch.cat([path[:100], path[100:101].repeat(60, 1), path[100:]])
+    assert int(standing(wait).sum()) == 60
+    assert int(standing(torch.cat([wait, wait])).sum()) == 120
+    drive = SimpleNamespace(coordinates=Coordinates(wait.double()))
+    assert int(passed_of(drive)[-1]) == 260 - 60
+    wait[3, 1] = torch.nan
+    assert int(standing(wait).sum()) == 60
+    drive = SimpleNamespace(coordinates=Coordinates(path[:60].double().repeat_interleave(30, 0)))
+    assert int(passed_of(drive)[-1]) == 60 * 30  # by a receiver slower than the camera
+    assert passed_of(None) is None
+
+
+def test_a_place_that_only_some_queries_see_is_no_hole():
+    """As in loops, where later places are seen by later queries alone, some of which repeat."""
+    rows = twice(200)
+    stalled = torch.cat([rows, rows[-1:].expand(60, -1)])
+    match = DejaVu(whitening="none").learn(stalled).loops(stalled, 30)
+    assert match.accepted[210:390].double().mean() > 0.9
 
 
 @pytest.mark.parametrize(

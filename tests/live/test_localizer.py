@@ -242,3 +242,18 @@ def test_two_threads_that_ask_one_localizer_are_refused(monkeypatch):
             pool.submit(localizer, frame).result()
         localizer(frame)  # the thread that holds it goes on
     localizer(frame)
+
+
+@pytest.mark.parametrize("sequence", ["filter", None])
+def test_a_stream_that_stalls_is_less_and_less_sure(spectral, drive, sequence):
+    localizer = LiveLocalizer(spectral, sequence)
+    found = [localizer(drive[min(t, 20)]) for t in range(50)]
+    assert [match.stale for match in found] == [0] * 21 + [*range(1, 30)]
+    sure = [match.posterior if sequence else match.probability for match in found]
+    assert sequence is None or sure[20] > 0.5
+    assert sequence is None or sure[49] < sure[30] < sure[20]
+    if sequence:
+        frames = drive[[min(t, 20) for t in range(50)]]
+        whole = spectral.localize(frames, sequence=PlaceFilter())
+        assert whole.stale.tolist() == [match.stale for match in found]
+        assert whole.index.tolist() == [match.place for match in found]

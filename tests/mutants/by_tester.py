@@ -1197,14 +1197,14 @@ MUTANTS = [
         "dejavu_torch/recognition/evidence.py",
         "else ~known & ~valid",
         "else (~known).expand_as(z)",
-        ("tests/test_loops.py", "tests/recognition/test_smoother.py::-k hole"),
+        ("tests/recognition/test_evidence.py::-k hole",),
     ),
     Mutant(
         "A picture that repeats tells a filter nothing.",
         "dejavu_torch/recognition/localizer.py",
         "if bool(again.any()):",
         "if False:",
-        ("tests/benchmarks/test_drives.py::-k otherwise", "tests/live"),
+        ("tests/live/test_localizer.py::-k stalls",),
     ),
     Mutant(
         "A picture that repeats says nothing of a drive.",

@@ -229,3 +229,13 @@ def test_values_of_no_weight_are_not_counted():
     z = noise(200, 3)
     weight = (torch.arange(600).view(200, 3) % 2).float()
     assert torch.equal(table_of(z, weight).values, table_of(z[weight > 0][:, None]).values)
+
+
+def test_a_place_is_a_hole_for_queries_that_do_not_see_it():
+    scores = torch.tensor([[1.0, 2, math.inf], [2, 1, math.inf], [1, 3, 0.5]])
+    std = standardised(scores, torch.tensor([1.0, 2, math.inf]))
+    assert std.holes is not None
+    assert std.holes.tolist() == [[False] * 2 + [True]] * 2 + [[False] * 3]
+    assert std.z.isfinite().all()
+    assert torch.equal(std.z[2:], standardised(scores[2:], torch.tensor([1.0, 2, 0])).z)
+    assert standardised(scores, torch.ones(3)).holes is None
