@@ -272,11 +272,16 @@ def board_of(name: str, data: Path, rate: float | None = None) -> Board:
     model.learn(reference)
     calibrate_if_possible(model, reference)
     if name == MERGED:
-        other = copy.deepcopy(model)
         added = fitted(opened(FOOTAGE[routes[1]].reference, data), reference.frame_shape)
-        other.learn_features(other.descriptor.all_of(added), added)
-        model = merge([model, other], routes)
+        model = merge([model, map_beside(model, added)], routes)
     return Board(model, routes, described(model, query), truth, FOOTAGE[routes[0]].tolerance)
+
+
+def map_beside(model: DejaVu, traverse: Traverse) -> DejaVu:
+    """A map of other footage by the descriptor of a model, to be merged."""
+    other = copy.deepcopy(model)
+    other.learn_features(other.descriptor.all_of(traverse), traverse)
+    return other
 
 
 def traverses(footage: Footage, data: Path) -> tuple[Traverse, Traverse, GroundTruth]:

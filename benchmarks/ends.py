@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import product
 from pathlib import Path
@@ -13,7 +12,7 @@ import torch.nn.functional as F
 from torch import Tensor
 from tqdm import tqdm
 
-from benchmarks.cross import FOOTAGE, SHARES, WAYS, Board, described, matches, traverses
+from benchmarks.cross import FOOTAGE, SHARES, WAYS, Board, described, map_beside, matches, traverses
 from benchmarks.measure import Column, Row, table, write_bench
 from dejavu_torch.data.ground_truth import GroundTruth, all_judged
 from dejavu_torch.data.traverse import Frames, Part, fitted
@@ -21,7 +20,7 @@ from dejavu_torch.evaluation.rejection import judged
 from dejavu_torch.growth import calibrate_if_possible, merge
 from dejavu_torch.maps.spectral import SpectralMapper
 from dejavu_torch.model import DejaVu
-from dejavu_torch.types import InputError, Traverse
+from dejavu_torch.types import InputError
 
 TENTH, THIRD = 0.1, 1 / 3
 HOLE = 40  # places
@@ -162,8 +161,7 @@ def _door(name: str, data: Path, whole: Board) -> Case:
     shape = model.frame_shape
     assert shape is not None
     added, query = fitted(more[0], shape), traverses(FOOTAGE[name], data)[1]
-    beside = model_of_features(model, added)
-    merged = merge([model, beside], (name, BESIDE[name]))
+    merged = merge([model, map_beside(model, added)], (name, BESIDE[name]))
     merged.calibration = model.calibration  # of one route, as the other has none of its own
     door, draw = torch.rand(shape[0], 4, 6, generator=torch.Generator().manual_seed(0)), torch.Generator()
     still = F.interpolate(door[None], size=shape[1:], mode="bilinear").expand(DOOR, *shape)
@@ -192,13 +190,6 @@ def model_of(frames: Tensor) -> DejaVu:
     model.learn(traverse)
     calibrate_if_possible(model, traverse)
     return model
-
-
-def model_of_features(model: DejaVu, traverse: Traverse) -> DejaVu:
-    """A map of other footage by the descriptor of one."""
-    other = copy.deepcopy(model)
-    other.learn_features(other.descriptor.all_of(traverse), traverse)
-    return other
 
 
 def _distances(lacks: Tensor) -> Tensor:

