@@ -94,10 +94,11 @@ def cases(name: str, data: Path) -> Iterator[Case]:
     def board(frames: Tensor) -> Board:
         return Board(model_of(frames), (name,), torch.zeros(0), truth, footage.tolerance)
 
-    def part(title: str, known: Board, lacks: Tensor, shift: int = 0) -> Case:
-        """All queries on a map that lacks some places (N,)."""
+    def part(title: str, known: Board, lacks: Tensor, shift: int | Tensor = 0) -> Case:
+        """All queries on a map that lacks some places (N,), before each of which are so many places fewer."""
         missing = torch.where(truth.positives >= 0, lacks[truth.positives.clamp(min=0)], True)
-        positives = torch.where(missing, -1, truth.positives - shift)
+        fewer = shift if isinstance(shift, int) else shift[truth.positives.clamp(min=0)]
+        positives = torch.where(missing, -1, truth.positives - fewer)
         beyond = _distances(lacks)
         far = torch.where(truth.positives >= 0, beyond[truth.positives.clamp(min=0)], 2**31).amin(1)
         off = missing.all(1) & truth.judged
@@ -119,6 +120,9 @@ def cases(name: str, data: Path) -> Iterator[Case]:
         title = "a hole of 10 %" if size == round(TENTH * count) else "a hole of 40"
         dark = torch.where(lacks.view(-1, *[1] * (frames.ndim - 1)), 0, frames)
         yield part(title, board(dark), lacks)
+    lacks = none.clone()
+    lacks[count // 2 - min(HOLE, count // 3) // 2 :][: min(HOLE, count // 3)] = True
+    yield part("frames missing, 40", board(frames[~lacks]), lacks, torch.cumsum(lacks, 0))
     asked = query[:]
     for made, (numbers, moves) in _stalls(len(asked)).items():
         own, moved = described(whole.model, query), GroundTruth(*(one[moves] for one in truth))
@@ -130,6 +134,7 @@ def cases(name: str, data: Path) -> Iterator[Case]:
             nothing = torch.zeros(len(asked), dtype=torch.bool)
             yield Case(f"a lens of {zoom:g}", whole, seen, truth, nothing, nothing)
     if name in BESIDE:
+        yield _half(name, data, whole)
         yield _door(name, data, whole)
 
 
@@ -152,6 +157,19 @@ def waits(name: str, data: Path) -> Iterator[Row]:
         some = slice(half, half + WAITS)
         accepted = int((match.accepted[some] & (match.index[some] >= half)).sum())
         yield {"case": name, "contender": title, "queries": len(drive), "loops_in_wait": accepted}
+
+
+def _half(name: str, data: Path, whole: Board) -> Case:
+    """Half of a drive, then as many frames of a drive over another route."""
+    query, shape = traverses(FOOTAGE[name], data)[1], whole.model.frame_shape
+    assert shape is not None
+    there, half = fitted(traverses(FOOTAGE[BESIDE[name]], data)[1], shape), len(query) // 2
+    parts = [Part(query, range(half)), Part(there, range(min(half, len(there))))]
+    own = whole.truth.positives[:half]
+    positives = torch.cat([own, own.new_full((len(parts[1]), own.shape[1]), -1)])
+    off = torch.arange(len(positives)) >= half
+    seen = torch.cat([described(whole.model, one) for one in parts])
+    return Case("half elsewhere", whole, seen, all_judged(positives), off, off)
 
 
 def _door(name: str, data: Path, whole: Board) -> Case:

@@ -550,7 +550,7 @@ class DejaVu(nn.Module):
             batches = self.descriptor.batches(copies, progress, "localizing", on_first)
             for rows in batches:
                 match = localizer(set_apart(self.map, rows) if turned else rows)
-                yield match if sequence is not None else replace(match, stale=None)
+                yield match
             return
         descriptors = self.described(queries, querying, centres, progress, on_first)
         yield answer(self.scorer(descriptors, matching), matching, progress)

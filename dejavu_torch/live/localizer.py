@@ -27,7 +27,6 @@ EXPECTED = "uint8 (H,W), (H,W,3) or (3,H,W), or float in [0, 1], or float (D,) f
 DTYPES = ("uint8", "float16", "bfloat16", "float32", "float64")
 SMALL = (HOG, Distilled, PatchPixels)  # features that one thread computes as fast as several
 MAX_SKIPPED = 100  # skipped frames that a filter moves for; after more, a jump finds the place again
-AGES = 0.9  # by which a single frame's probability falls with each frame that repeats the picture before it
 ROUNDING = 1e-3  # tolerance of the range [0, 1]
 
 
@@ -180,10 +179,6 @@ class LiveLocalizer:
         x, y = layout.coordinates(match.index).tolist()
         stale = 0 if match.stale is None else int(match.stale)
         probability = math.nan if match.probability is None else float(match.probability)
-        accepted, precision = bool(match.accepted), self._localizer.matching.acceptance.precision
-        if self.sequence is None:  # which knows of no motion: the picture is older with each frame
-            probability *= AGES**stale
-            accepted &= precision is None or probability >= precision
         return LiveMatch(
             place=place,
             frame=int(table.own_frame_of(match.index)),
@@ -191,7 +186,7 @@ class LiveLocalizer:
             score=score,
             posterior=math.exp(-score) if self._filters else math.nan,
             probability=probability,
-            accepted=accepted,
+            accepted=bool(match.accepted),
             milliseconds=milliseconds,
             route=layout.names("")[int(layout.route_of(match.index))] if place >= 0 else "",
             x=x,

@@ -35,6 +35,7 @@ from dejavu_torch.recognition.views import Views
 from dejavu_torch.text import with_progress
 from dejavu_torch.types import Match, SequenceModel, State, Together, check_shape, expect
 
+AGES = 0.9  # by which a single image's probability falls with each repeat of its picture
 CACHED = 2**20  # scores processed at a time: they stay in the cache
 
 
@@ -151,10 +152,16 @@ class Localizer:
         return self._with_stale(self._without_blank(Match.joined(parts), scorer))
 
     def _with_stale(self, match: Match) -> Match:
-        """Answers with how often their pictures had been repeated."""
+        """Answers with how often their pictures had been repeated. Those of single images know of no motion:
+        they get less sure from the second repeat on, as videos of another rate repeat one."""
         count, shape = len(match), (-1, *[1] * (match.index.ndim - 1))
-        stale, self.stale = self.stale[:count], self.stale[count:]
-        return replace(match, stale=stale.view(shape).expand_as(match.index))
+        stale, self.stale = self.stale[:count].view(shape).expand_as(match.index), self.stale[count:]
+        probability, accepted = match.probability, match.accepted
+        if not self.models and probability is not None:
+            probability = probability * AGES ** (stale - 1).clamp(min=0)
+            precision = self.matching.acceptance.precision
+            accepted = accepted if precision is None else accepted & (probability >= precision)
+        return replace(match, stale=stale, probability=probability, accepted=accepted)
 
     def _mirrored(self, scorer: Scorer, queries: Tensor) -> Tensor | None:
         """Confidences in some of the queries, mirrored, and their best scores, (B,2), NaN for the others, if
@@ -363,8 +370,7 @@ def answer(
         return replace(alone, sequences=found.sequences)
     if way is not None:
         return _as_it_drives(scorer, matching, progress, verb)
-    match = Localizer(None, matching, layout=scorer.layout).next(scorer, progress, verb)
-    return replace(match, stale=None)  # each image is answered by itself
+    return Localizer(None, matching, layout=scorer.layout).next(scorer, progress, verb)
 
 
 def _as_it_drives(scorer: Scorer, matching: Matching, progress: bool, verb: str) -> Match:
