@@ -315,13 +315,81 @@ class Steps(NamedTuple):
         return [(1 - share) / off] * off + [share]
 
 
+class Chained(NamedTuple):
+    """`Steps`, beside which a camera keeps one of some speeds p / q places a query: a cycle of q chains, each
+    with all states but that off the map. The free motion is the last chain.
+
+    shares: of each speed, and of the free motion, that go on as each. slip: of the moves off by a place.
+    """
+
+    steps: Steps
+    speeds: Sequence[tuple[int, int]]
+    shares: Sequence[Row]
+    slip: float
+
+    @property
+    def places(self):
+        return self.steps.places
+
+    @property
+    def directions(self):
+        return self.steps.directions
+
+    def chains(self):
+        """Speed, phase, and moves of each chain, and how many its speed has."""
+        found = []
+        for i, (p, q) in enumerate(self.speeds):
+            for phase in range(q):
+                move = (phase + 1) * p // q - phase * p // q
+                moves = [0.0] * (move + 2)
+                moves[move + 1] += self.slip / 2
+                moves[move] += 1 - self.slip
+                moves[max(0, move - 1)] += self.slip / 2
+                found.append((i, phase, moves, q))
+        return [*found, (len(self.speeds), 0, self.steps.moves, 1)]
+
+    def enters(self):
+        """How much of what comes from elsewhere each chain gets."""
+        count = len(self.speeds)
+        return [0.5 if i == count else 0.5 / count / q for i, _, _, q in self.chains()]
+
+    def transitions(self):
+        chains, size = self.chains(), self.places * self.directions
+        off = len(chains) * size
+        matrix = [[0.0] * (off + 1) for _ in range(off + 1)]
+        for c, (i, phase, _, q) in enumerate(chains):
+            for d, (j, later, moves, r) in enumerate(chains):
+                share = self.shares[i][j] / r
+                if i == j:
+                    share = self.shares[i][i] if later == (phase + 1) % q else 0.0
+                alone = self.steps._replace(moves=moves)
+                alone = alone._replace(jump=0.0, leave=0.0).transitions()
+                stay = share * (1 - self.steps.jump - self.steps.leave)
+                for a in range(size):
+                    for b in range(size):
+                        matrix[c * size + a][d * size + b] += stay * alone[a][b]
+                    matrix[c * size + a][off] += stay * alone[a][size]
+        for c in range(off + 1):
+            rate = self.steps.enter if c == off else self.steps.jump
+            for d, enters in enumerate(self.enters()):
+                for b in range(size):
+                    matrix[c][d * size + b] += rate * enters / size
+            matrix[c][off] += 1 - self.steps.enter if c == off else self.steps.leave
+        return matrix
+
+    def start(self):
+        *on, off = self.steps.start()
+        return [*(enters * one for enters in self.enters() for one in on), off]
+
+
 def forward_backward(steps, evidence, still):
     """Probability of each state for each query, and the log likelihood of all queries, from the log evidence
     of each place, (Q,N), relative to being off the map; a query that stands still has the state before it."""
-    matrix, states = steps.transitions(), range(steps.places * steps.directions + 1)
-    likelihood = []
+    matrix = steps.transitions()
+    states, likelihood = range(len(matrix)), []
     for row in evidence:
-        ways = [*row, *reversed(row)] if steps.directions == 2 else row
+        ways = [*row, *reversed(row)] if steps.directions == 2 else [*row]
+        ways = ways * ((len(matrix) - 1) // len(ways))
         likelihood.append([*(math.exp(one) for one in ways), 1.0])
     before = [steps.start()]
     for t in range(1, len(evidence)):
@@ -343,11 +411,13 @@ def forward_backward(steps, evidence, still):
 
 def all_paths(steps, evidence, still):
     """Every sequence of states with its probability times likelihood, as in `forward_backward`."""
-    matrix, states, found = steps.transitions(), range(2 * steps.places + 1), {}
+    matrix, found = steps.transitions(), {}
+    states = range(len(matrix))
     for path in product(states, repeat=len(evidence)):
         value = steps.start()[path[0]]
         for t, state in enumerate(path):
-            ways = [*evidence[t], *reversed(evidence[t]), 0.0]
+            ways = [*evidence[t], *reversed(evidence[t])]
+            ways = [*ways * ((len(matrix) - 1) // len(ways)), 0.0]
             if t and not still[t]:
                 value *= matrix[path[t - 1]][state]
             elif t:

@@ -7,6 +7,8 @@ to whole drives of thirteen routes, ``python -m benchmarks chosen data/`` tells:
 
 from __future__ import annotations
 
+from fractions import Fraction
+
 # Evidence: how queries depend on each other, and what a score says; on recorded drives, later on `drives`.
 SMALLEST = 0.05  # autocorrelation of descriptors at which the sum over lags ends, which is tau
 SHARPENED = 0.6  # tau' = SHARPENED tau queries count as one
@@ -47,6 +49,18 @@ OTHER_SPEED, PER_QUERY, CLEARLY = 30.0, 0.1, 5.0
 FITTED, STRETCH, STRETCHES = 1000, 100, 10  # at most; queries in a stretch, and stretches
 FEWEST_FITTED, SAMPLED = 20, 2**21  # at least; and their scores at most otherwise
 CORRELATED = 4  # correlation times in a stretch, at least
+
+# Steady speeds, on `storage --drives` at half a byte and on `drives`, of city 1, corridor, gardens, laps,
+# lidar and the railway's first half. There is none of 0: the queries of a stop are alike, and where they are
+# not, a stretch of places that look alike would pass for one.
+STEADY = tuple(map(Fraction, ("1/3", "1/2", "1", "3/2", "2", "3", "5")))  # places a query
+SLIP = 0.04  # share of the moves that are a place more or less
+KEEPS, TO_NEXT, STAYS_FREE = 0.98, 0.6, 0.9  # a speed is kept; else the next ones follow; free motion goes on
+CHANGE_COUNTS, CHANGE_ROUNDS = (
+    30.0,
+    2,
+)  # what this counts as, for each speed, beside a drive; rounds of fitting
+SELDOM = 0.2  # share of the queries at which a speed does not occur
 
 # Over areas, on `areas`: among so many windows a right one has to stand out more than along a route.
 FLIGHT_SEPARATION, LEAST_FLIGHT_SEPARATION = 3.0, 1.0  # standard deviations of scores

@@ -201,7 +201,7 @@ def _seen(
     fitted_one: called with 1 for each drive, when its smoother is fitted.
     """
     spacings: dict[int, Spacing] = {}  # of descriptors that several drives share
-    fitted: dict[tuple[int, States, int, type[Motion]], list[tuple[int, DriveQuery, Drive]]] = {}
+    fitted: dict[tuple[int, States, int, type[Motion], int], list[tuple[int, DriveQuery, Drive]]] = {}
     for i, asked in enumerate(drives):
         scorer, smoother = asked.scorer, asked.smoother.changed(map_links=asked.scorer.links)
         asked = asked._replace(smoother=smoother)
@@ -223,6 +223,7 @@ def _seen(
             smoother.states(layout.places, layout.starts),
             len(smoother.move_logits),
             smoother.motion,
+            id(smoother.steady),
         )
         fitted.setdefault(kind, []).append((i, asked, smoother.drive(scorer.rows, descriptors, spacing)))
     for (queries, states, *_), alike in fitted.items():

@@ -54,7 +54,7 @@ class Motion(ABC):
     learns no rates. `directions` are those of the `States` that a smoother makes it of.
     """
 
-    directions = 1
+    directions = chains = 1
 
     def __init__(self, states: States, rates: Rates) -> None:
         self.states, self.rates = states, rates
@@ -75,7 +75,7 @@ class Motion(ABC):
         both = (self.rates.leave + self.rates.enter).clamp(min=MIN_PROBABILITY)
         off = (self.rates.leave / both).clamp(max=0.5)
         on = 1 - off[..., None]
-        places = self.states.directions * self.states.places
+        places = self.chains * self.states.directions * self.states.places
         off = off[..., None] + on * (1 - self.states.share)
         return torch.cat([(on * self.each).expand(*off.shape[:-1], places), off], -1)
 
@@ -260,12 +260,20 @@ class FittedPart(NamedTuple):
     std: Standardised
     weight: Tensor
     still: Tensor
-    over: Callable[[Rates], Motion]
+    over: Callable[..., Motion]
 
     def part(self, first: int, last: int) -> FittedPart:
         """The queries [first, last) of each stretch."""
         std = self.std.map(lambda column: column.narrow(self.weight.ndim - 1, first, last - first))
         return FittedPart(std, self.weight[..., first:last], self.still[..., first:last], self.over)
+
+    def some(self, every: int) -> FittedPart:
+        """Of several stretches, one in so many; of one, so much less."""
+        if self.weight.ndim == 1:
+            return self.part(0, -(-len(self.weight) // every))
+        return FittedPart(
+            self.std.map(lambda one: one[::every]), self.weight[::every], self.still[::every], self.over
+        )
 
 
 class Fit(NamedTuple):
@@ -364,7 +372,7 @@ def learn(
                 sums += motion.told(
                     block, std, normal.narrow(-2, first, last - first), weight * std.speaks, table
                 )
-                counts.append(motion.counts(*_steps(block, after, sample.still)))
+                counts.append(motion.counts(*steps(block, after, sample.still)))
                 after = block.likelihood[..., :1, :] * block.after[..., :1, :]
         separation = max(least, float(sums[0] / sums[1].clamp(min=MIN_PROBABILITY)))
         evidence = Evidence(table.values, separation, evidence.tempering)
@@ -372,7 +380,7 @@ def learn(
     return rates, evidence
 
 
-def _steps(block: Block, after: Tensor | None, still: Tensor) -> tuple[Tensor, Tensor]:
+def steps(block: Block, after: Tensor | None, still: Tensor) -> tuple[Tensor, Tensor]:
     """The steps from the queries of a block to those after them, for `Motion.counts`; `after` is the message
     of the first query behind it."""
     before, seen = block.before * block.likelihood, (block.likelihood * block.after)[..., 1:, :]

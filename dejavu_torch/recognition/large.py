@@ -255,8 +255,9 @@ class LargeDrive:
         for window in self.windows[::-1]:
             sample = self._sample(window, slice(window.start, window.stop), smoother)
             evidence = Evidence(smoother.values, smoother.separation, smoother.tempering)
-            (block,) = explained(sample, evidence, sample.over(rates), len(sample.weight))
+            motion = smoother.over_states(self.states.of(window.places), rates)
+            mass = torch.cat([block.by_place for block in explained(sample, evidence, motion)][::-1])
             own = slice(window.first - window.start, window.last - window.start)
             z = window.z[own].float() * self.spread[window.first : window.last, None]
             scores = self.means[window.places] - z + self.mean[window.first : window.last, None]
-            yield window.first, block.by_place[own], scores, window.places
+            yield window.first, mass[own], scores, window.places

@@ -1,6 +1,7 @@
 """A step along routes as loops, in single precision; compiled by numba, where it is installed.
 
-Beliefs are (S,): the places in one or two directions (D,N), then being off the map; see `AlongRoute`.
+Beliefs are (S,): the places in one or two directions, by chain, (M,D,N), then being off the map; see
+`AlongRoute`.
 """
 
 from __future__ import annotations
@@ -16,14 +17,15 @@ Numbers = NDArray[np.int64]
 Doubles = NDArray[np.float64]
 
 # A route is `keep` (D,N), links as direction, from and to (L,3), with their shares (L,), the probability of a
-# turn, and whether it is plain, without ends or links; a motion, moves (C,V+1), the shares of a state's mass
-# that go anywhere, and off the map, (C,S) each, and the mass of each place of what goes anywhere.
+# turn, and whether it is plain, without ends or links; a motion, moves (C,M,V+1) of M chains, the shares of a
+# state's mass that go anywhere, and off the map, (C,S) each, the mass of each place of what goes anywhere, by
+# chain, (M,), and the shares of a chain that go on as each chain, (M,M).
 ROUTE = "Tuple((float32[:,::1], int64[:,::1], float32[::1], float32, boolean))"
-MOTION = "Tuple((float32[:,::1], float32[:,::1], float32[:,::1], float32))"
+MOTION = "Tuple((float32[:,:,::1], float32[:,::1], float32[:,::1], float32[::1], float32[:,::1]))"
 SEEN = "float32[:,::1], float32[:,:,::1], boolean[:,::1]"
 SWEPT = f"void({SEEN}, {MOTION}, {ROUTE}, float32[:,:,::1], float32[:,::1])"
 Route = tuple[Floats, Numbers, Floats, float, bool]
-Steps = tuple[Floats, Floats, Floats, float]
+Steps = tuple[Floats, Floats, Floats, Floats, Floats]
 
 
 WORTH_COMPILING = 2**17  # numbers that torch takes longer for than numba does to load
@@ -90,6 +92,8 @@ def _by_all_moves(on: Floats, moves: Floats, route: Route, back: bool, scratch: 
         for d in range(keep.shape[0]):
             own, moved = on[d * n : d * n + n], out[d * n : d * n + n]
             for v in range(1, min(len(moves), n)):
+                if moves[v] == 0:  # most, of a steady speed
+                    continue
                 if back:
                     _added(moves[v], own[v:], moved)
                 else:
@@ -103,6 +107,18 @@ def _by_all_moves(on: Floats, moves: Floats, route: Route, back: bool, scratch: 
         _added(moves[v], one, out)
 
 
+def _changed(on: Floats, change: Floats, back: bool, out: Floats) -> None:
+    """Mass (M D N), of which shares go on as other chains, or its transpose."""
+    chains = len(change)
+    size = len(on) // chains
+    out[:] = 0
+    for i in range(chains):
+        for j in range(chains):
+            if change[i, j] > 0:
+                first, last = (j, i) if back else (i, j)
+                _added(change[i, j], on[first * size :][:size], out[last * size :][:size])
+
+
 def _ahead(
     belief: Floats,
     likelihood: Floats,
@@ -113,10 +129,11 @@ def _ahead(
     totals: Floats,
 ) -> None:
     """`Motion.ahead`, of drives (C,B,S); the belief (C,S) becomes the last one."""
-    (moves, free, gone, each), (keep, _, _, turn, _) = motion, route
+    (moves, free, gone, each, change), (keep, _, _, turn, _) = motion, route
     drives, queries, states = likelihood.shape
-    n = states - 1
-    start, scratch = np.empty(n, np.float32), np.empty((2, n), np.float32)
+    n, chains = states - 1, len(each)
+    size = n // chains
+    start, other, scratch = np.empty(n, np.float32), np.empty(n, np.float32), np.empty((2, size), np.float32)
     for c in range(drives):
         own = belief[c]
         for t in range(queries):
@@ -124,14 +141,19 @@ def _ahead(
             if still[c, t]:
                 out[:] = own
             else:
-                anywhere = np.float32(each) * _product(own, free[c])
-                if keep.shape[0] > 1:
-                    _turned(own[:n], turn, start)
-                else:
-                    start[:] = own[:n]
-                _by_all_moves(start, moves[c], route, False, scratch, out[:n])
-                for i in range(n):
-                    out[i] += anywhere
+                anywhere, start[:] = _product(own, free[c]), own[:n]
+                if chains > 1:
+                    _changed(own[:n], change, False, start)
+                for m in range(chains):
+                    first, last = m * size, m * size + size
+                    moved, jumped = out[first:last], anywhere * each[m]
+                    if keep.shape[0] > 1:
+                        _turned(start[first:last], turn, other[first:last])
+                    else:
+                        other[first:last] = start[first:last]
+                    _by_all_moves(other[first:last], moves[c, m], route, False, scratch, moved)
+                    for i in range(size):
+                        moved[i] += jumped
                 out[n] = _product(own, gone[c])
             _times(out, likelihood[c, t], own)
             total = np.float32(0)
@@ -151,10 +173,11 @@ def _behind(
     totals: Floats,
 ) -> None:
     """`Motion.behind`, of drives (C,B,S); the message (C,S) becomes that of the first query."""
-    (moves, free, gone, each), (keep, _, _, turn, _) = motion, route
+    (moves, free, gone, each, change), (keep, _, _, turn, _) = motion, route
     drives, queries, states = likelihood.shape
-    n = states - 1
-    back, scratch = np.empty(n, np.float32), np.empty((2, n), np.float32)
+    n, chains = states - 1, len(each)
+    size = n // chains
+    back, other, scratch = np.empty(n, np.float32), np.empty(n, np.float32), np.empty((2, size), np.float32)
     for c in range(drives):
         own = message[c]
         for t in range(queries - 1, -1, -1):
@@ -166,15 +189,22 @@ def _behind(
             _scaled(1 / total, own, own)
             if still[c, t]:
                 continue
-            off = own[n]
-            total = np.float32(1) - off
-            _by_all_moves(own[:n], moves[c], route, True, scratch, back)
-            if keep.shape[0] > 1:
-                _turned(back, turn, own[:n])
-            else:
-                own[:n] = back
+            off, anywhere = own[n], np.float32(0)
+            for m in range(chains):
+                first, last, total = m * size, m * size + size, np.float32(0)
+                for i in range(first, last):
+                    total += own[i]
+                anywhere += each[m] * total
+                _by_all_moves(own[first:last], moves[c, m], route, True, scratch, back[first:last])
+                if keep.shape[0] > 1:
+                    _turned(back[first:last], turn, other[first:last])
+                else:
+                    other[first:last] = back[first:last]
+            own[:n] = other
+            if chains > 1:
+                _changed(other, change, True, own[:n])
             own[n] = 0
-            _added(np.float32(each) * total, free[c], own)
+            _added(anywhere, free[c], own)
             _added(off, gone[c], own)
 
 
@@ -260,7 +290,7 @@ def _looked_up(z: Floats, values: Floats, lowest: float, steps: float, out: Floa
 
 
 FAST = {"reassoc", "nsz", "contract"}  # not "nnan" and "ninf", which lose NaN and infinity
-CALLS = _turned, _added, _scaled, _product, _times, _shifted, _by_all_moves
+CALLS = _turned, _added, _scaled, _product, _times, _shifted, _by_all_moves, _changed
 compiled_by = partial(compiled, what="drives by torch", calls=CALLS, fastmath=FAST)
 
 

@@ -16,6 +16,7 @@ from dejavu_torch.recognition import chosen, loops
 from dejavu_torch.recognition.engine import MIN_PROBABILITY, Block, Counts, Motion, Rates
 from dejavu_torch.recognition.evidence import LOWEST, PER_DEVIATION, RankTable, Standardised
 from dejavu_torch.recognition.loops import Route
+from dejavu_torch.recognition.speeds import FREE, Speeds
 from dejavu_torch.types import InputError
 
 
@@ -25,15 +26,25 @@ class AlongRoute(Motion):
     A camera at a place moves on by 0 to V places, with turning round before, jumps to any place, or leaves
     the map; moving past the end of a route leaves it too. Off the map, it enters at any place.
 
-    Rates of several drives (C,) go with beliefs (C,S); `best_moved` and `counts` take those of one.
+    Beside this free motion there may be steady `Speeds`, whose chains have states of their own: (M,D,N), the
+    free ones last, then being off the map.
+
+    Rates of several drives (C,) go with beliefs (C,S); `best_moved` and `counts` take those of one, and
+    `counts` those without speeds.
     """
 
     directions = 2
 
-    def __init__(self, states: States, rates: Rates) -> None:
+    def __init__(self, states: States, rates: Rates, speeds: Speeds = FREE) -> None:
         super().__init__(states, rates)
         _, jump, leave, enter = rates
-        self.moves = ((1 - jump - leave)[..., None] * rates.moves)[..., None, None].unbind(-3)
+        self.change, self.chains = speeds.change.to(rates.moves), len(speeds.change)
+        if self.chains > 1:
+            self.each = self.each * speeds.enter.to(rates.moves).repeat_interleave(
+                states.directions * states.places
+            )
+        moves = speeds.beside(rates.moves) * (1 - jump - leave)[..., None, None]
+        self.moves = moves[..., None, None].unbind(-3)
         last, taken = states.places - 1, rates.moves.new_zeros(states.directions, states.places)
         ways: list[tuple[int, int, int, float]] = []
         for first, second, share in states.links:
@@ -53,8 +64,8 @@ class AlongRoute(Motion):
         self.lost = (torch.stack(self.moves, -3) * (1 - torch.stack(self.reach))).sum(-3)
         # the shares of a state's mass (S,) that go anywhere, and off the map
         jump, leave, enter = (rate[..., None] for rate in (jump, leave, enter))
-        self.free = torch.cat([jump.expand(*jump.shape[:-1], keep.numel()), enter], -1)
-        left = torch.cat([self._turned(self.lost).flatten(-2) + leave, 1 - enter], -1)
+        self.free = torch.cat([jump.expand(*jump.shape[:-1], self.chains * keep.numel()), enter], -1)
+        left = torch.cat([self._began(self.lost).flatten(-3) + leave, 1 - enter], -1)
         self.gone = left + (1 - states.share) * self.free
 
     def _shifted(self, on: Tensor) -> Tensor:
@@ -104,9 +115,27 @@ class AlongRoute(Motion):
             return on
         return torch.lerp(on, on.flip(-1, -2), self.states.turn)
 
+    def _changed(self, on: Tensor, change: Tensor) -> Tensor:
+        """Mass (..., M, D, N), of which shares go on as other chains."""
+        return on if self.chains == 1 else (change @ on.flatten(-2)).view(on.shape)
+
+    def _began(self, message: Tensor) -> Tensor:
+        """What a message after turning, and changing the chain, says of before."""
+        return self._turned(self._changed(message, self.change))
+
     def _split(self, state: Tensor) -> tuple[Tensor, Tensor]:
-        """The places (..., D, N), and being off the map (..., 1)."""
-        return state[..., :-1].unflatten(-1, (self.states.directions, -1)), state[..., -1:]
+        """The places (..., M, D, N), and being off the map (..., 1)."""
+        return state[..., :-1].unflatten(-1, (self.chains, self.states.directions, -1)), state[..., -1:]
+
+    def wide(self, places: Tensor, off: float) -> Tensor:
+        wide = super().wide(places, off)
+        return wide if self.chains == 1 else torch.cat([*[wide[..., :-1]] * self.chains, wide[..., -1:]], -1)
+
+    def folded(self, mass: Tensor) -> Tensor:
+        if self.chains > 1:
+            on, off = self._split(mass)
+            mass = torch.cat([on.sum(-3).flatten(-2), off], -1)
+        return super().folded(mass)
 
     @staticmethod
     def _share(belief: Tensor, goes: Tensor) -> Tensor:
@@ -115,14 +144,15 @@ class AlongRoute(Motion):
 
     def moved(self, belief: Tensor) -> Tensor:
         on, _ = self._split(belief)
-        moved = self._by_all_moves(self._turned(on), back=False).flatten(-2)
+        on = self._changed(self._turned(on), self.change.mT)
+        moved = self._by_all_moves(on, back=False).flatten(-3)
         anywhere, off = (self._share(belief, goes)[..., None] for goes in (self.free, self.gone))
         return torch.cat([moved + anywhere * self.each, off], -1)
 
     def expected(self, message: Tensor) -> Tensor:
         on, off = self._split(message)
-        moved = self._turned(self._by_all_moves(on, back=True)).flatten(-2)
-        anywhere = self.each * message[..., :-1].sum(-1, keepdim=True)
+        moved = self._began(self._by_all_moves(on, back=True)).flatten(-3)
+        anywhere = (self.each * message[..., :-1]).sum(-1, keepdim=True)
         return F.pad(moved, (0, 1)) + (anywhere * self.free + off * self.gone)
 
     def ahead(self, belief: Tensor, likelihood: Tensor, still: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -158,16 +188,21 @@ class AlongRoute(Motion):
         if likelihood.numel() < loops.WORTH_COMPILING or self._differs:
             return None
         count = math.prod(drives)
-        each = (torch.stack(self.moves, -3)[..., 0, 0], self.free, self.gone)
-        rates = (one.reshape(-1, one.shape[-1]).expand(count, -1) for one in each)
+        moves = torch.stack(self.moves, -3)[..., 0, 0]
+        goes = (one.reshape(-1, one.shape[-1]) for one in (self.free, self.gone))
+        moves = moves.reshape(-1, *moves.shape[-2:])
+        rates = (one.expand(count, *one.shape[1:]) for one in (moves, *goes))
+        places = self.states.directions * self.states.places
+        each = torch.as_tensor(self.each, dtype=start.dtype).expand(self.chains * places)[::places]
         start = start.expand(*drives, states).reshape(count, states).clone()
-        arrays = self._readable(start, likelihood.reshape(count, queries, states), *rates)
+        seen = likelihood.reshape(count, queries, states)
+        arrays = self._readable(start, seen, *rates, each.contiguous(), self.change)
         if arrays is None or (kernel := loop()) is None:
             return None
-        (own, seen, *motion), route = arrays
-        out, totals = np.empty_like(seen), np.empty(seen.shape[:2], np.float32)
+        (own, like, *motion), route = arrays
+        out, totals = np.empty_like(like), np.empty(like.shape[:2], np.float32)
         rests = still.reshape(count, queries).contiguous().numpy()
-        kernel(own, seen, rests, (*motion, self.each), route, out, totals)
+        kernel(own, like, rests, (*motion,), route, out, totals)
         shapes = ((out, likelihood.shape), (totals, still.shape), (own, (*drives, states)))
         before, log, last = (torch.from_numpy(one).view(shape) for one, shape in shapes)
         return before, log, last
@@ -175,7 +210,7 @@ class AlongRoute(Motion):
     @property
     def _differs(self) -> bool:
         """Whether it is of a kind of motion that changes what the loops compute."""
-        steps = "moved", "expected", "near", "folded"
+        steps = "moved", "expected", "near", "wide", "folded"
         return any(getattr(type(self), one) is not getattr(AlongRoute, one) for one in steps)
 
     def _readable(self, *tensors: Tensor) -> tuple[list[Floats], Route] | None:
@@ -194,7 +229,10 @@ class AlongRoute(Motion):
         """Log probabilities of the best way to each state in a step, from those before it (Viterbi)."""
         on, off = self._split(log)
         _, jump, _, enter = self.rates
-        anywhere = jump * self.each
+        each = torch.as_tensor(self.each, dtype=log.dtype, device=log.device).expand(on.numel()).view_as(on)
+        anywhere, highest = jump * each, on.amax()
+        if self.chains > 1:
+            on = (on[:, None] + self.change.log()[..., None, None]).amax(0)
         turn = self.states.turn if self.states.directions == 2 else 0.0
         best = torch.full_like(on, -math.inf)
         for move in self.moves[::-1]:
@@ -203,9 +241,9 @@ class AlongRoute(Motion):
             if turn:
                 turned = on.flip(-1, -2) + (move * turn + anywhere).log()
                 best = torch.maximum(best, turned)
-        jumped = torch.maximum(on.amax() + anywhere.log(), off + (enter * self.each).log())
+        jumped = torch.maximum(highest + anywhere.log(), off + (enter * each).log())
         left = log + self.gone.log()
-        return torch.cat([best.flatten().maximum(jumped), left.amax()[None]])
+        return torch.cat([best.maximum(jumped).flatten(), left.amax()[None]])
 
     def _best_shifted(self, on: Tensor) -> Tensor:
         moved = F.pad(on[..., :-1], (1, 0), value=-math.inf)
@@ -219,24 +257,36 @@ class AlongRoute(Motion):
 
     def counts(self, before: Tensor, after: Tensor) -> Counts:
         (on, off), (on_after, off_after) = self._split(before), self._split(after)
-        start, off, off_after = self._turned(on), off[..., 0], off_after[..., 0]
+        start, off, off_after = self._turned(on)[..., 0, :, :], off[..., 0], off_after[..., 0]
         total = before[..., :-1].sum(-1)
         mean = torch.lerp(off_after, after[..., :-1].mean(-1), self.states.share)
         _, jump, leave, enter = self.rates
         lost, kinds = torch.stack([(1 - reach).flatten() for reach in self.reach]), []
         if (found := self._counted(before, after, lost)) is not None:
-            kinds = [move[0, 0] * one for move, one in zip(self.moves, found.unbind(-1), strict=True)]
+            kinds = [move[0, 0, 0] * one for move, one in zip(self.moves, found.unbind(-1), strict=True)]
         else:
-            shifts = self._shifts(on_after, back=True)
+            shifts = self._shifts(on_after[..., 0, :, :], back=True)
             for move, gone, shifted in zip(self.moves, lost, shifts, strict=True):
                 gone = off_after * (start.flatten(-2) @ gone)
-                kinds.append(move[0, 0] * ((start * shifted).sum((-1, -2)) + gone))
+                kinds.append(move[0, 0, 0] * ((start * shifted).sum((-1, -2)) + gone))
         kinds += [jump * total * mean, leave * total * off_after]
         kinds += [enter * off * mean, (1 - enter) * off * off_after]
         each = torch.stack(kinds, -1).flatten(0, -2)
         total = each.sum(-1, keepdim=True)
         counts = torch.where(total > 0, each / total.clamp(min=MIN_PROBABILITY), 0).sum(0)
         return Counts(counts[:-4], *counts[-4:])
+
+    def changes(self, before: Tensor, after: Tensor) -> Tensor:
+        """Expected numbers of changes of the chain in some steps, (B,S) as in `counts` -> (M,M)."""
+        (on, off), (on_after, off_after) = self._split(before), self._split(after)
+        back = self._by_all_moves(on_after, back=True) + self.lost * off_after[..., None, None]
+        joint = self.change * (self._turned(on).flatten(-2) @ back.flatten(-2).mT)
+        _, jump, leave, enter = (rate[..., None] for rate in self.rates)
+        anywhere = (self.each * after[..., :-1]).sum(-1, keepdim=True)
+        others = before[..., :-1].sum(-1, keepdim=True) * (jump * anywhere + leave * off_after)
+        others = others + off * (enter * anywhere + (1 - enter) * off_after)
+        total = joint.sum((-1, -2), keepdim=True) + others[..., None]
+        return torch.where(total > 0, joint / total.clamp(min=MIN_PROBABILITY), 0).flatten(0, -3).sum(0)
 
     def _counted(self, before: Tensor, after: Tensor, lost: Tensor) -> Tensor | None:
         """The weight of each move without its probability, (..., V+1), by a loop of `loops`."""

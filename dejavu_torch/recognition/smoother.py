@@ -23,9 +23,11 @@ from dejavu_torch.recognition.engine import (
     FittedPart,
     Motion,
     Rates,
+    explained,
     learn,
     nats,
     size_of,
+    steps,
     sweep,
 )
 from dejavu_torch.recognition.evidence import (
@@ -39,6 +41,7 @@ from dejavu_torch.recognition.evidence import (
 )
 from dejavu_torch.recognition.filter import near_scores
 from dejavu_torch.recognition.motion import AlongRoute, checked_rates, logits
+from dejavu_torch.recognition.speeds import FREE, Speeds, steady
 from dejavu_torch.recognition.taken import Singly, moves_along
 from dejavu_torch.types import Facts, InputError, SequenceModel, expect
 
@@ -132,6 +135,7 @@ class PlaceSmoother(SequenceModel):
         self.jumps = 0.0  # nats that learned jumps add, in place of rare ones
         self.singly: Singly | None = None  # what single images say, if they were asked
         self.correlation = 1.0  # tau of these queries
+        self.steady = FREE  # beside free motion, of a fitted drive
         self.is_drive = True  # whether the queries that were fitted to are a drive of the map
         self.prior, self.rate_prior, self.first_separation = moves, (jump, leave, enter), float(separation)
         self.register_buffer("values", torch.zeros(0), persistent=False)  # of the rank table
@@ -211,12 +215,16 @@ class PlaceSmoother(SequenceModel):
                 reached = reached + motion.expected(target).log()
             states.append(int(reached.argmax()))
         state, n = torch.tensor(states[::-1], dtype=torch.int64), scores.shape[1]
-        place = torch.where(state < n, state, 2 * n - 1 - state)
-        return torch.where(state < motion.states.directions * n, place, -1)
+        off, place = motion.anywhere().shape[-1] - 1, state % (2 * n)
+        return torch.where(state < off, torch.where(place < n, place, 2 * n - 1 - place), -1)
 
     def steps(self, places: int, route_starts: Sequence[int], like: Tensor) -> Motion:
         """The transitions of a map, in the type of its scores."""
-        return self.motion(self.states(places, route_starts), self.rates(like))
+        return self.over_states(self.states(places, route_starts), self.rates(like))
+
+    def over_states(self, states: States, rates: Rates) -> Motion:
+        """The transitions between some states, with the speeds of the drive."""
+        return AlongRoute(states, rates, self.steady) if self.steady.speeds else self.motion(states, rates)
 
     def rates(self, like: Tensor) -> Rates:
         moves, (_, jump, leave) = (one.to(like).softmax(0) for one in (self.move_logits, self.rate_logits))
@@ -314,7 +322,7 @@ class PlaceSmoother(SequenceModel):
     def forgetful(self) -> Self:
         """A copy with parameters of its own, without what an earlier drive told."""
         own = {name: nn.Parameter(rate.detach().clone()) for name, rate in self.named_parameters()}
-        told = {"log_likelihood": None, "singly": None, "nats_per_query": 0.0, "jumps": 0.0}
+        told = {"log_likelihood": None, "singly": None, "nats_per_query": 0.0, "jumps": 0.0, "steady": FREE}
         return self.changed(is_drive=False, **told, **own)
 
     @torch.no_grad()
@@ -329,6 +337,9 @@ class PlaceSmoother(SequenceModel):
         fits = (like._fitted(samples, ranks, start, moving) for start in (self.prior, *others))
         best = first_that_explains(fits, moving, different)
         nats_per_query = like.tempering * best.held / max(1.0, different)
+        is_drive, speeds = moves_along(best.held, nats_per_query), FREE
+        if is_drive and self.motion is AlongRoute:
+            speeds = speeds_of(samples, best)
         jump, leave, enter = map(float, best.rates[1:])
         learned = {
             "move_logits": logits(*best.rates.moves.tolist()),
@@ -337,7 +348,8 @@ class PlaceSmoother(SequenceModel):
         }
         return like.changed(
             nats_per_query=nats_per_query,
-            is_drive=moves_along(best.held, nats_per_query),
+            is_drive=is_drive,
+            steady=speeds,
             log_likelihood=best.log,
             jumps=best.log - best.held,
             separation=best.evidence.separation,
@@ -372,6 +384,7 @@ class PlaceSmoother(SequenceModel):
             "jumps": self.jumps,
             **singly,
             "moves": self.move_logits.softmax(0).tolist(),
+            "speeds": [float(speed) for speed in self.steady.speeds],
             "jump": jump,
             "leave": leave,
             "enter": float(self.enter_logit.sigmoid()),
@@ -413,14 +426,13 @@ def blocks_together(
     drives: Sequence[tuple[PlaceSmoother, Drive]], route_starts: Sequence[int] = (0,), size: int | None = None
 ) -> Iterator[Block]:
     """As `PlaceSmoother.blocks`, of C drives in one sweep: (C,B,S). All have as many queries, places and
-    moves, and the same links."""
+    moves, and the same links and speeds."""
     means = [drive.means for _, drive in drives]
     queries, places = len(drives[0][1].spacing.stopped), len(means[0])
     rates = (smoother.rates(mean) for (smoother, _), mean in zip(drives, means, strict=True))
     first = drives[0][0]
-    motion = first.motion(
-        first.states(places, route_starts), Rates(*map(torch.stack, zip(*rates, strict=True)))
-    )
+    together = Rates(*map(torch.stack, zip(*rates, strict=True)))
+    motion = first.over_states(first.states(places, route_starts), together)
 
     def likelihood(first: int, last: int) -> Tensor:
         numbers = torch.arange(first, last)
@@ -429,6 +441,22 @@ def blocks_together(
 
     still = torch.stack([drive.spacing.stopped for _, drive in drives]).to(means[0].device)
     yield from sweep(motion, likelihood, queries, still, size or size_of(motion, still))
+
+
+def speeds_of(samples: Sequence[FittedPart], fit: Fit) -> Speeds:
+    """The steady speeds that occur in stretches of a drive, by its evidence and free motion, and how it
+    changes between them."""
+    speeds = steady()
+    for _ in range(chosen.CHANGE_ROUNDS):
+        counts = []
+        for sample in samples:
+            motion, after = sample.over(fit.rates, speeds), None
+            assert isinstance(motion, AlongRoute)
+            for block in explained(sample, fit.evidence, motion):
+                counts.append(motion.changes(*steps(block, after, sample.still)))
+                after = block.likelihood[..., :1, :] * block.after[..., :1, :]
+        speeds = speeds.learned(torch.stack(counts).sum(0).cpu())
+    return speeds
 
 
 def first_that_explains(fits: Iterator[Fit], moving: float, different: float) -> Fit:

@@ -19,6 +19,7 @@ from dejavu_torch.recognition import engine
 from dejavu_torch.recognition import smoother as smoothing
 from dejavu_torch.recognition.calibration import Platt, confidence_of
 from dejavu_torch.recognition.drive import DriveQuery, doubt, localize_drive, localize_drives
+from dejavu_torch.recognition.motion import AlongRoute
 from dejavu_torch.recognition.scorer import OfRows
 from dejavu_torch.recognition.smoother import PlaceSmoother
 
@@ -126,8 +127,12 @@ def test_places_and_queries_without_scores_are_not_answered():
         assert match.accepted.sum() == 68
 
 
+class Plain(AlongRoute):
+    """Without steady speeds, which slip."""
+
+
 def test_answers_that_are_nearly_sure_have_different_scores():
-    sure = PlaceSmoother((0.0, 1.0), jump=1e-9, leave=1e-9, within=3)
+    sure = PlaceSmoother((0.0, 1.0), jump=1e-9, leave=1e-9, within=3, motion=Plain)
     match = localized(shown(80, range(80), clear=9.0), sure)
     assert match.index[:, 0].tolist() == [*range(80)]
     assert float(match.score.min()) < 1e-12

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+from fractions import Fraction
 
 import pytest
 import torch
@@ -22,6 +23,7 @@ from dejavu_torch.recognition.localizer import Matching, answer
 from dejavu_torch.recognition.motion import AlongRoute
 from dejavu_torch.recognition.scorer import OfRows
 from dejavu_torch.recognition.smoother import PlaceSmoother
+from dejavu_torch.recognition.speeds import FREE, steady
 
 NUMBA = importlib.util.find_spec("numba") is not None
 
@@ -51,13 +53,13 @@ def test_a_sweep_is_that_of_hmmlearn(steps, queries, size, seed):
     assert float(sum(block.log.sum() for block in blocks)) == pytest.approx(total)
 
 
-def single(steps):
+def single(steps, speeds=FREE):
     """The motion in single precision, and of two drives at once, of which the second moves more."""
     moves, *rest = (torch.tensor(one, dtype=torch.float32) for one in steps[1:5])
     other = torch.cat([moves[1:], moves[:1]])
     rates = Rates(torch.stack([moves, other]), *(one.expand(2) for one in rest))
     states = States(steps.places, steps.directions, tuple(steps.starts), tuple(steps.links), steps.turn)
-    return AlongRoute(states, Rates(moves, *rest)), AlongRoute(states, rates)
+    return AlongRoute(states, Rates(moves, *rest), speeds), AlongRoute(states, rates, speeds)
 
 
 @pytest.mark.skipif(not NUMBA, reason="numba is not installed")
@@ -90,6 +92,26 @@ def test_loops_do_as_torch_does(steps, queries, seed):
             torch.testing.assert_close(own, other, atol=1e-5, rtol=1e-4)
         torch.testing.assert_close(told, one.told(block, *scores, tables[1]), atol=1e-5, rtol=1e-4)
         torch.testing.assert_close(tables[0].counts, tables[1].counts, atol=1e-5, rtol=1e-4)
+
+
+@pytest.mark.skipif(not NUMBA, reason="numba is not installed")
+@given(steps_of(), st.sampled_from(["1", "1/2 3", "1/3 3/2 5"]), st.integers(0, 99))
+def test_loops_keep_speeds_as_torch_does(steps, speeds, seed):
+    one, two = single(steps, steady([*map(Fraction, speeds.split())]))
+    draw = torch.Generator().manual_seed(seed)
+    size = len(one.anywhere())
+    likelihood, starts = torch.rand(2, 4, size, generator=draw) + 1e-3, torch.rand(2, size, generator=draw)
+    still = torch.rand(2, 4, generator=draw) < 0.3
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(loops, "WORTH_COMPILING", 1)
+        for motion, start in ((one, starts), (one, starts[0]), (two, starts)):
+            expected = Motion.ahead(motion, start, likelihood, still)
+            for own, other in zip(motion.ahead(start, likelihood, still), expected, strict=True):
+                torch.testing.assert_close(own, other, atol=1e-5, rtol=1e-4)
+            after, message = motion.behind(starts, likelihood, still)
+            literal, last = Motion.behind(motion, starts, likelihood, still)
+            torch.testing.assert_close(normalised(after), normalised(literal), atol=1e-5, rtol=1e-4)
+            torch.testing.assert_close(normalised(message), normalised(last), atol=1e-5, rtol=1e-4)
 
 
 class Stairs(Motion):

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import math
+from fractions import Fraction
 
 import pytest
 import torch
 from helpers import refused
 from hypothesis import given
 from hypothesis import strategies as st
-from reference import Steps
+from reference import Chained, Steps
 
 from dejavu_torch.places.states import States
+from dejavu_torch.recognition import chosen
 from dejavu_torch.recognition.engine import Rates
 from dejavu_torch.recognition.motion import AlongRoute, checked_rates
+from dejavu_torch.recognition.speeds import FREE, Speeds, steady
 
 
 @st.composite
@@ -37,16 +40,28 @@ def steps_of(draw):
 
 
 def motion_of(steps):
+    speeds = FREE
+    if isinstance(steps, Chained):
+        shares = torch.tensor(steps.shares, dtype=torch.float64)
+        steps, speeds = steps.steps, Speeds(tuple(Fraction(*one) for one in steps.speeds), shares)
     rates = (torch.tensor(one, dtype=torch.float64) for one in steps[1:5])
     states = States(steps.places, steps.directions, tuple(steps.starts), tuple(steps.links), steps.turn)
-    return AlongRoute(states, Rates(*rates))
+    return AlongRoute(states, Rates(*rates), speeds)
+
+
+@st.composite
+def chained(draw):
+    """Steps, mostly with steady speeds beside free moves."""
+    speeds = draw(st.sampled_from([(), ((1, 1),), ((1, 2), (3, 1)), ((1, 3), (2, 3), (3, 2))]))
+    steps, shares = draw(steps_of()), steady([Fraction(*one) for one in speeds]).shares if speeds else None
+    return steps if shares is None else Chained(steps, speeds, shares.tolist(), chosen.SLIP)
 
 
 def matrix_of(steps):
     return torch.tensor(steps.transitions(), dtype=torch.float64)
 
 
-@given(steps_of())
+@given(chained())
 def test_a_step_is_that_of_the_matrix_and_keeps_the_mass(steps):
     matrix, motion = matrix_of(steps), motion_of(steps)
     states = torch.eye(len(matrix), dtype=torch.float64)
@@ -56,7 +71,7 @@ def test_a_step_is_that_of_the_matrix_and_keeps_the_mass(steps):
     assert (motion.lost >= 0).all()
 
 
-@given(steps_of(), st.integers(0, 99))
+@given(chained(), st.integers(0, 99))
 def test_leading_dimensions_are_steps_of_their_own(steps, seed):
     motion, generator = motion_of(steps), torch.Generator().manual_seed(seed)
     beliefs = torch.rand(2, 3, len(steps.start()), dtype=torch.float64, generator=generator)
@@ -93,6 +108,27 @@ def test_counts_are_those_of_each_pair_of_states(steps, seed):
     expected = (joint / joint.sum(1, keepdim=True)).sum(0)
     counts = motion_of(steps).counts(before, after * 1e-3)
     assert torch.allclose(torch.cat([counts.moves, torch.stack(counts[1:])]), expected)
+
+
+@given(chained(), st.integers(0, 99))
+def test_changes_are_those_of_each_pair_of_states(steps, seed):
+    generator = torch.Generator().manual_seed(seed)
+    before, after = torch.rand(2, 4, len(steps.start()), dtype=torch.float64, generator=generator)
+    motion, alone = motion_of(steps), {"jump": 0.0, "leave": 0.0, "enter": 0.0}
+    free = (
+        steps._replace(steps=steps.steps._replace(**alone)) if motion.chains > 1 else steps._replace(**alone)
+    )
+    moving, size = matrix_of(free), steps.places * steps.directions
+    moving[-1] = 0
+    base = steps.steps if motion.chains > 1 else steps
+    moving = moving * (1 - base.jump - base.leave)
+    total = torch.einsum("ti,ij,tj->t", before, matrix_of(steps), after)
+    joint = before[:, :, None] * moving * after[:, None] / total[:, None, None]
+    on = joint[:, :-1, :-1].unflatten(1, (-1, size)).unflatten(3, (-1, size)).sum((0, 2, 4))
+    assert torch.allclose(motion.changes(before, after).sum(), joint.sum())
+    gone = motion.changes(before, after) - on
+    assert (gone > -1e-12).all()
+    assert torch.allclose(gone.sum(1), joint[:, :-1, -1].unflatten(1, (-1, size)).sum((0, 2)))
 
 
 def test_routes_end_and_a_circuit_does_not():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from fractions import Fraction
 from itertools import product
 
 import pytest
@@ -11,11 +12,13 @@ from devices import pretend
 from helpers import refused
 from hypothesis import given
 from hypothesis import strategies as st
-from reference import Steps, all_paths, forward_backward
+from reference import Chained, Steps, all_paths, forward_backward
 
+from dejavu_torch.recognition import chosen
 from dejavu_torch.recognition.engine import normalised, sweep
 from dejavu_torch.recognition.motion import AlongRoute
 from dejavu_torch.recognition.smoother import PlaceSmoother, stretches, updated_rates
+from dejavu_torch.recognition.speeds import FREE, steady
 
 MOVES = (0.2, 0.5, 0.2, 0.1)
 
@@ -37,9 +40,9 @@ def evidence(smoother, scores):
     return drive.log_likelihood(torch.arange(len(scores))), drive.spacing.stopped
 
 
-def folded(states):
-    """Of both directions, the mass of the places, and of being off the map."""
-    there, back = states[:, :-1].chunk(2, 1)
+def folded(states, places):
+    """Of all chains and both directions, the mass of the places, and of being off the map."""
+    there, back = states[:, :-1].unflatten(1, (-1, 2, places)).sum(1).unbind(1)
     return torch.cat([there + back.flip(1), states[:, -1:]], 1)
 
 
@@ -50,7 +53,9 @@ def steps_of(smoother, places, starts=(0,)):
     ends, links = (*starts[1:], places), smoother.links
     if smoother.loop:
         links += tuple((end - 1, start, 1.0) for start, end in zip(starts, ends, strict=True))
-    return Steps(places, moves, jump, leave, enter, smoother.turn, 2, starts, links)
+    steps = Steps(places, moves, jump, leave, enter, smoother.turn, 2, starts, links)
+    speeds = [(speed.numerator, speed.denominator) for speed in smoother.steady.speeds]
+    return Chained(steps, speeds, smoother.steady.shares.tolist(), chosen.SLIP) if speeds else steps
 
 
 SMOOTHER = st.builds(
@@ -65,14 +70,17 @@ SMOOTHER = st.builds(
     links=st.sampled_from([(), ((1, 0, 0.5),)]),
     loop=st.booleans(),
 )
+STEADY = st.sampled_from(["", "1", "1/2 3", "1/3 3/2"]).map(
+    lambda speeds: steady([*map(Fraction, speeds.split())]) if speeds else FREE
+)
 SHAPE = st.tuples(st.integers(1, 9), st.integers(2, 6), st.integers(0, 99))
 
 
-@given(SMOOTHER, SHAPE, st.integers(1, 5), st.booleans())
-def test_equals_a_literal_loop_in_blocks_of_any_size(smoother, shape, size, two_routes):
+@given(SMOOTHER, STEADY, SHAPE, st.integers(1, 5), st.booleans())
+def test_equals_a_literal_loop_in_blocks_of_any_size(smoother, steady, shape, size, two_routes):
     queries, places, seed = shape
     scores, starts = noise(queries, places, seed=seed).double(), (0, 1) if two_routes else (0,)
-    smoother = smoother.double()
+    smoother = smoother.double().changed(steady=steady)
     log, still = evidence(smoother, scores)
     steps = steps_of(smoother, places, starts)
     expected, total = forward_backward(steps, log.tolist(), still.tolist())
@@ -80,7 +88,7 @@ def test_equals_a_literal_loop_in_blocks_of_any_size(smoother, shape, size, two_
     found = smoother.posterior(scores, route_starts=starts)
     blocks = list(smoother.blocks(smoother.drive(scores), starts, size))
     assert smoother.log_evidence(scores, route_starts=starts).item() == pytest.approx(total, abs=1e-9)
-    assert torch.allclose(found, folded(states), atol=1e-9)
+    assert torch.allclose(found, folded(states, places), atol=1e-9)
     assert torch.allclose(found.sum(1), torch.ones(queries, dtype=torch.float64))
     assert [block.first for block in blocks] == [*range(0, queries, size)][::-1]
     assert torch.allclose(torch.cat([block.posterior for block in blocks[::-1]]), states, atol=1e-9)
@@ -102,7 +110,7 @@ def test_a_stop_moves_nowhere_and_counts_once():
     steps = steps_of(smoother, 2)
     expected, total = forward_backward(steps, log.tolist(), still.tolist())
     states = torch.tensor(expected, dtype=torch.float64)
-    assert torch.allclose(smoother.posterior(scores), folded(states))
+    assert torch.allclose(smoother.posterior(scores), folded(states, 2))
     assert smoother.log_evidence(scores).item() == pytest.approx(total)
     assert torch.equal(smoother.path(scores)[1:23], smoother.path(scores)[1].expand(22))
 
@@ -276,7 +284,7 @@ def test_queries_that_say_nothing_are_as_without_them():
     log[20:25] = 0
     expected, _ = forward_backward(steps_of(smoother, 60), log.tolist(), [False] * 60)
     for one in found:
-        assert torch.allclose(one, folded(torch.tensor(expected)), atol=1e-4)
+        assert torch.allclose(one, folded(torch.tensor(expected), 60), atol=1e-4)
     assert found[0][20:25, :-1].argmax(1).tolist() == [*range(20, 25)]
 
 
