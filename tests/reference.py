@@ -264,6 +264,12 @@ class Steps(NamedTuple):
     directions: int = 2
     starts: Sequence[int] = (0,)  # the first place of each route
     links: Sequence[tuple[int, int, float]] = ()
+    back: float = 0.5  # share of what comes from elsewhere that travels in the second direction
+
+    def elsewhere(self):
+        """How much of what comes from elsewhere each state of a place gets."""
+        ways = [1 - self.back, self.back] if self.directions == 2 else [1.0]
+        return [way / self.places for way in ways for _ in range(self.places)]
 
     def onward(self, place, way):
         """Where a move by one place leads to, with probabilities; None is off the map."""
@@ -303,16 +309,15 @@ class Steps(NamedTuple):
                             for to, part in onward.items():
                                 moved[to] = moved.get(to, 0.0) + share * part
                         at = moved
-                for state in range(off):
-                    row[state] += self.jump / off
+                for state, each in enumerate(self.elsewhere()):
+                    row[state] += self.jump * each
                 row[off] += self.leave
-        matrix[off] = [self.enter / off] * off + [1 - self.enter]
+        matrix[off] = [*(self.enter * each for each in self.elsewhere()), 1 - self.enter]
         return matrix
 
     def start(self):
-        off = self.places * self.directions
         share = min(0.5, self.leave / (self.leave + self.enter))
-        return [(1 - share) / off] * off + [share]
+        return [*((1 - share) * each for each in self.elsewhere()), share]
 
 
 class Chained(NamedTuple):
@@ -372,8 +377,8 @@ class Chained(NamedTuple):
         for c in range(off + 1):
             rate = self.steps.enter if c == off else self.steps.jump
             for d, enters in enumerate(self.enters()):
-                for b in range(size):
-                    matrix[c][d * size + b] += rate * enters / size
+                for b, each in enumerate(self.steps.elsewhere()):
+                    matrix[c][d * size + b] += rate * enters * each
             matrix[c][off] += 1 - self.steps.enter if c == off else self.steps.leave
         return matrix
 

@@ -39,7 +39,7 @@ from dejavu_torch.recognition.coarse import CoarseSearch, SamplingPlan
 from dejavu_torch.recognition.engine import Evidence, FittedPart, Rates, explained, normalised
 from dejavu_torch.recognition.evidence import RankTable, standardised
 from dejavu_torch.recognition.localizer import Matching
-from dejavu_torch.recognition.plane import ByPlace, Followed, PlaneMotion
+from dejavu_torch.recognition.plane import Followed, PlaneMotion
 from dejavu_torch.recognition.samples import RowSearch
 from dejavu_torch.recognition.scorer import OfRows
 from dejavu_torch.recognition.search import Scan
@@ -255,19 +255,21 @@ def test_a_filter_moves_over_an_area(small_tiles, area):
     kernel = torch.rand(5, 5, generator=torch.Generator().manual_seed(2))
     kernel /= kernel.sum()
     rates = Rates(kernel.flatten(), *torch.tensor([0.05, 0.1, 0.2]))
-    motion = ByPlace(area, rates)
+    motion = PlaneMotion(area, rates)
     step = transitions(area.cells(torch.arange(places)), kernel, *rates[1:])
     belief, message = torch.rand(2, places + 1, generator=torch.Generator().manual_seed(0))
     belief /= belief.sum()
-    torch.testing.assert_close(motion.moved(belief), (belief.double() @ step).float())
-    torch.testing.assert_close(motion.expected(message), (step @ message.double()).float())
+    moved, before = motion.moved(motion.unfolded(belief)), motion.expected(motion.unfolded(message))
+    torch.testing.assert_close(motion.folded(moved), (belief.double() @ step).float())
+    torch.testing.assert_close(motion.folded(before), (step @ message.double()).float())
     assert float(motion.anywhere().sum()) == pytest.approx(1)
-    counts = motion.counts(belief[None], message[None])
+    counts = motion.counts(motion.unfolded(belief)[None], motion.unfolded(message)[None])
     assert float(counts.moves.sum() + sum(counts[1:])) == pytest.approx(1)
     # of one move between two windows
     one, two = torch.zeros(2, places + 1)
     one[area.place_at(torch.tensor([3, 4]))] = two[area.place_at(torch.tensor([2, 6]))] = 1
-    counts = ByPlace(area, rates._replace(jump=torch.tensor(0.0))).counts(one[None], two[None])
+    one, two = (motion.unfolded(belief)[None] for belief in (one, two))
+    counts = PlaneMotion(area, rates._replace(jump=torch.tensor(0.0))).counts(one, two)
     assert counts.moves.nonzero().tolist() == [[5 * 1 + 4]]
     kernel = Followed(torch.zeros(25)).moves_after(torch.tensor([0.2, 0.3, 0.5])).view(5, 5)
     torch.testing.assert_close(kernel, kernel.T)

@@ -265,5 +265,6 @@ def test_the_documentation_runs_and_a_filter_goes_from_state_to_state(tmp_path, 
     assert [abs(int(place) - 40) <= 5 for place in found] == [True] * 4
     route, model = DejaVu.load("road.safetensors").eval(), PlaceFilter()
     queries = open_source("sim:aerial?frames=64&traverse=1")[30:42]
-    facts = assert_streams(Path("drive.onnx"), route, model, [65], queries)
+    states = [1 + 64 * len(model.steady.change) * 2]  # both ways
+    facts = assert_streams(Path("drive.onnx"), route, model, states, queries)
     assert facts["threshold"] == model.likely

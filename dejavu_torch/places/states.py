@@ -21,7 +21,8 @@ class States(NamedTuple):
         route_starts: the first place of each route; no move crosses from one route into the next.
         links: further steps, in place of that to the next place; backwards in the opposite direction. Those
             from one place that have more than 1 in all share it.
-        turn: probability of turning round in a step, if there are two directions.
+        turn: probability of turning round in a step, if there are two directions. back: share of what comes
+            from elsewhere that travels in the second one.
         share: of the places of a map that these are; the others are off the map.
     """
 
@@ -31,6 +32,7 @@ class States(NamedTuple):
     links: tuple[Link, ...] = ()
     turn: float = 0.0
     share: float = 1.0
+    back: float = 0.5
 
     def of(self, places: Tensor) -> States:
         """The states of some places (n,) in order; moves end at each gap."""
@@ -39,4 +41,4 @@ class States(NamedTuple):
         at = {place: i for i, place in enumerate(places.tolist())} if self.links else {}
         links = tuple((at[one], at[two], share) for one, two, share in self.links if {one, two} <= at.keys())
         routes, share = tuple(starts.nonzero()[:, 0].tolist()), len(places) / self.places
-        return States(len(places), self.directions, routes, links, self.turn, share)
+        return States(len(places), self.directions, routes, links, self.turn, share, self.back)

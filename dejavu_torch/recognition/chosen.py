@@ -60,6 +60,8 @@ CHANGE_COUNTS, CHANGE_ROUNDS = (
     30.0,
     2,
 )  # what this counts as, for each speed, beside a drive; rounds of fitting
+LIVE = STEADY[1:-1]  # of a filter, which cannot learn them: on all routes of `drives`, one in two and three
+KEEPS_LIVE, BACK = 0.99, 0.2  # likewise; share of the cameras that travel against the order of the places
 SELDOM = 0.2  # share of the queries at which a speed does not occur
 
 # Over areas, on `areas`: among so many windows a right one has to stand out more than along a route.

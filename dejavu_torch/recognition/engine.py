@@ -89,10 +89,15 @@ class Motion(ABC):
         moves = torch.zeros_like(self.rates.moves)
         return Counts(moves, *moves.new_zeros(4))
 
-    def wide(self, places: Tensor, off: float) -> Tensor:
-        """Numbers of the places (..., N) for all states (..., S)."""
+    def wide(self, places: Tensor, off: float | Tensor) -> Tensor:
+        """Numbers of the places (..., N), and that off the map, (..., 1), for all states (..., S)."""
         ways = [places, places.flip(-1)][: self.states.directions]
-        return torch.cat([*ways, places.new_full((*places.shape[:-1], 1), off)], -1)
+        off = off if isinstance(off, Tensor) else places.new_full((*places.shape[:-1], 1), off)
+        return torch.cat([*ways, off], -1)
+
+    def unfolded(self, posterior: Tensor) -> Tensor:
+        """A belief in all states by one in the places and in being off the map, (N+1,) -> (S,)."""
+        return self.wide(posterior[:-1], posterior[-1:])
 
     def folded(self, mass: Tensor) -> Tensor:
         """Mass of all states (..., S) -> of the places, whichever way, and off the map, (..., N+1)."""

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
+from fractions import Fraction
 from typing import NamedTuple
 
 import torch
@@ -14,11 +15,13 @@ from typing_extensions import Self
 from dejavu_torch.memory import is_plain, without_autocast
 from dejavu_torch.places.layout import ROUTE, Layout
 from dejavu_torch.places.states import States
+from dejavu_torch.recognition import chosen
 from dejavu_torch.recognition.engine import MIN_PROBABILITY, Motion, Rates
 from dejavu_torch.recognition.motion import AlongRoute, checked_rates, logits
 from dejavu_torch.recognition.online import Learned
-from dejavu_torch.recognition.plane import SHARP, ByPlace, Followed
+from dejavu_torch.recognition.plane import SHARP, Followed, PlaneMotion
 from dejavu_torch.recognition.sequence import each
+from dejavu_torch.recognition.speeds import FREE, steady
 from dejavu_torch.types import InputError, SequenceModel, expect
 
 # by the dimensions of a layout; over an area images are farther apart
@@ -50,7 +53,8 @@ class FilterState(NamedTuple):
     """What a filter knows between queries.
 
     Attributes:
-        belief: (N+1,), given the queries so far, the off-map probability last; all 0 before the first one.
+        belief: (S,), of the states of the motion given the queries so far, being off the map last; all 0
+            before the first one.
         posterior: (N+1,), of the latest answer, which with a lag depends on later queries as well.
         learned: what the queries so far tell, if the filter learns.
         waiting: (R,N), scores of the queries that wait for their answers.
@@ -75,15 +79,19 @@ class FilterState(NamedTuple):
 class PlaceFilter(SequenceModel):
     """The place of the latest query given all queries: the forward algorithm of a hidden Markov model.
 
-    Its states are the N places and one off-map state. A place scored z standard deviations below the mean of
+    Its states are the N places, in both directions of travel and at several speeds, and one off-map state. A
+    place scored z standard deviations below the mean of
     a query's scores has the likelihood exp(sharpness z), the off-map state exp(sharpness off_map).
 
     Args:
-        moves: probabilities of moving by 0, 1, .., V places from one query to the next; they add up to 1.
-            Moving past the end of the map leaves it. In an area, weights of the windows so many rows or
-            columns away, whichever are more; from there on the moves of the latest queries count. The
-            default is replaced there by equal weights of windows up to 5 away.
+        moves: probabilities of moving by 0, 1, .., V places from one query to the next, where no steady speed
+            is kept; they add up to 1. Moving past the end of the map leaves it. In an area, weights of the
+            windows so many rows or columns away, whichever are more; from there on the moves of the latest
+            queries count. The default is replaced there by equal weights of windows up to 5 away.
         jump: probability of being anywhere on the map next. leave, enter: of leaving and entering the map.
+        turn: probability of turning round in a step. back: share of the cameras that travel against the order
+            of the places; with 0, none does, and none turns.
+        speeds: steady ones, in places a query, see `Speeds`; a filter that learns keeps none.
         sharpness: nats per standard deviation; low, since consecutive frames are similar. The default is
             replaced by 2 in an area.
         off_map: standard deviations; a query with no place further below the mean suggests being off the map.
@@ -132,9 +140,13 @@ class PlaceFilter(SequenceModel):
         threshold: float | None = None,
         lag: int = 0,
         learns: bool = False,
+        turn: float = 0.002,
+        back: float = chosen.BACK,
+        speeds: Sequence[Fraction | float] = chosen.LIVE,
     ) -> None:
         super().__init__()
         moves = checked_rates(moves, jump, leave, enter)
+        expect(0 <= turn <= 1 and 0 <= back <= 1, "probabilities", f"turn {turn}, back {back}")
         fits = 0 < sharpness < math.inf and math.isfinite(off_map)
         expect(fits, "finite numbers, the sharpness above 0", f"sharpness {sharpness}, off_map {off_map}")
         expect(isinstance(within, int) and within >= 0, "a whole number, at least 0", within=within)
@@ -146,6 +158,7 @@ class PlaceFilter(SequenceModel):
         self.log_sharpness = nn.Parameter(torch.tensor(float(sharpness), dtype=torch.float32).log())
         self.off_map = nn.Parameter(torch.tensor(float(off_map), dtype=torch.float32))
         self.within, self.threshold, self.lag, self.learns = within, threshold, lag, learns
+        self.turn, self.back, self.steady = turn, back, steady(speeds, chosen.KEEPS_LIVE)
         self.layout = ROUTE  # of the places, see `over`
 
     def over(self, layout: Layout) -> Self:
@@ -162,13 +175,27 @@ class PlaceFilter(SequenceModel):
 
     def start(self, places: int, fixed: bool = False) -> FilterState:
         new = self.off_map.detach().new_zeros
-        kind, moves = self._learned, len(self.move_logits)
+        kind, moves, states = self._learned, len(self.move_logits), self._states(places)
         learned = None if kind is None else kind.unpacked(new(kind.size(places, moves)), places, moves)
-        return FilterState(new(places + 1), new(places + 1), learned, new(0, places), (), new(0))
+        return FilterState(new(states), new(places + 1), learned, new(0, places), (), new(0))
+
+    @property
+    def _ways(self) -> int:
+        """How many states of the motion each place has."""
+        return (1 if self.learns else len(self.steady.change)) * (2 if self.back else 1)
+
+    def _places(self, states: int) -> int:
+        """How many places a belief in so many states is of."""
+        return self.layout.places if self.layout.dimensions == 2 else (states - 1) // self._ways
+
+    def _states(self, places: int) -> int:
+        """How many states a belief has."""
+        layout = self.layout
+        return 1 + (layout.rows * layout.columns if layout.dimensions == 2 else self._ways * places)
 
     def packed(self, state: FilterState) -> Tensor:
-        """The state of a filter without a lag: its belief (N+1,), or, if it learns, that and what is learned
-        in rows (R,N+1)."""
+        """The state of a filter without a lag: its belief (S,), or, if it learns, that and what is learned
+        in rows (R,S)."""
         if state.learned is None:
             return state.belief
         numbers = torch.cat([state.belief, *state.learned])
@@ -176,10 +203,11 @@ class PlaceFilter(SequenceModel):
 
     def unpacked(self, state: Tensor) -> FilterState:
         """The state that was packed."""
-        places, rows = state.shape[-1] - 1, state.reshape(-1, state.shape[-1])
+        places, rows = self._places(state.shape[-1]), state.reshape(-1, state.shape[-1])
         kind, learned = self._learned, rows[1:].flatten()
         known = None if kind is None else kind.unpacked(learned, places, len(self.move_logits))
-        return FilterState(rows[0], rows[0], known, state.new_zeros(0, places), (), state.new_zeros(0))
+        none = state.new_zeros(0, places)
+        return FilterState(rows[0], state.new_zeros(places + 1), known, none, (), none[:, 0])
 
     def forward(self, scores: Tensor, before: Tensor | None = None) -> Tensor:
         if scores.ndim > 2:
@@ -200,7 +228,9 @@ class PlaceFilter(SequenceModel):
         check_posterior(before, scores.shape[-1])
         state = self.start(scores.shape[-1])
         if before is not None:
-            state = state._replace(belief=before, posterior=before)
+            motion = self.motion(scores, (0,), state.learned)
+            belief = motion.unfolded(before.to(scores))
+            state = state._replace(belief=belief, posterior=before)
         return self._answers(scores, state, last=True)[0]
 
     def step(
@@ -229,10 +259,10 @@ class PlaceFilter(SequenceModel):
         belief = state.belief
         if state.left_out:
             return state._replace(left_out=(*state.left_out[:-1], state.left_out[-1] + queries))
-        motion = self.motion(belief[:-1], route_starts, state.learned)
+        motion = self.motion(state.posterior[:-1], route_starts, state.learned)
         for _ in range(queries if bool(belief.any()) else 0):
             belief = motion.moved(belief)
-        return state._replace(belief=belief, posterior=state.posterior if self.lag else belief)
+        return state._replace(belief=belief, posterior=state.posterior if self.lag else motion.folded(belief))
 
     def waiting(self, state: FilterState) -> Tensor:
         """Scores (R,N) of the queries that wait for their answers."""
@@ -262,8 +292,8 @@ class PlaceFilter(SequenceModel):
         if self.layout.places and self.layout.places != places:
             own = f"those of the map's {self.layout.places} places"
             raise InputError(f"scores are {tuple(scores.shape)}; expected {own}")
-        if state.belief.shape != (places + 1,):
-            shapes = f"the posterior is {tuple(state.belief.shape)}; expected {(places + 1,)}"
+        if state.posterior.shape != (places + 1,) or len(state.belief) != self._states(places):
+            shapes = f"the posterior is {tuple(state.posterior.shape)}; expected {(places + 1,)}"
             raise InputError(f"{shapes} for this map")
         belief, posterior, learned, waiting, left, known_absent = state.to(scores)
         absent = scores.new_zeros(len(scores)) if absent is None else absent.to(scores)
@@ -280,6 +310,7 @@ class PlaceFilter(SequenceModel):
                 motion = self.motion(scores, route_starts, learned)
                 some = Moments(*(one[ahead] for one in moments))
                 seen = self.likelihoods(scores[ahead], some, learned, absent[ahead])
+            seen = motion.wide(seen[:, :-1], seen[:, -1:])
             expected = motion.moved(belief)
             if t == 0:
                 expected = torch.where((belief == 0).all(), motion.anywhere(), expected)
@@ -287,19 +318,17 @@ class PlaceFilter(SequenceModel):
             posterior = belief
             if self.lag:
                 posterior = updated(belief, self._message(motion, seen, left_out[ahead]))
-            posteriors.append(posterior)
+            posteriors.append(motion.folded(posterior))
             if learned is not None:
                 z = (moments.mean[t] - scores[t]).where(moments.valid[t], 0) / moments.spread[t]
                 moves = motion.counts(before[None], seen[:1]).moves
-                learned = learned.after(z, moments.varied[t, 0], expected[:-1], moves)
+                learned = learned.after(z, moments.varied[t, 0], motion.folded(expected)[:-1], moves)
             for _ in range(left_out[t]):
                 belief = motion.moved(belief)
         answers = torch.stack(posteriors) if posteriors else scores.new_zeros(0, places + 1)
-        return (
-            answers,
-            scores[:due],
-            FilterState(belief, posterior, learned, scores[due:], left_out[due:], absent[due:]),
-        )
+        latest = answers[-1] if posteriors else posterior
+        after = FilterState(belief, latest, learned, scores[due:], left_out[due:], absent[due:])
+        return answers, scores[:due], after
 
     def _message(self, motion: Motion, likelihoods: Tensor, left_out: Sequence[int]) -> Tensor:
         """What the queries after the first one say of it, (R,N+1) -> (N+1,)."""
@@ -338,7 +367,12 @@ class PlaceFilter(SequenceModel):
         moves, (_, jump, leave) = (one.to(like).softmax(0) for one in (self.move_logits, self.rate_logits))
         moves = moves if learned is None else learned.moves_after(moves)
         rates = Rates(moves, jump, leave, self.enter_logit.to(like).sigmoid())
-        return MOTIONS[self.layout.dimensions](self.layout, rates, like.shape[-1], route_starts)
+        if self.layout.dimensions == 2:
+            return PlaneMotion(self.layout, rates)
+        layout, places, directions = self.layout, like.shape[-1], 2 if self.back else 1
+        states = layout.states() if layout.places else States(places, route_starts=tuple(route_starts))
+        states = states._replace(directions=directions, turn=self.turn, back=self.back)
+        return AlongRoute(states, rates, FREE if self.learns else self.steady)
 
     def check(self, queries: int | None, places: int) -> None:
         seen = f"a lag of {self.lag} where all queries are known"
@@ -358,21 +392,11 @@ class PlaceFilter(SequenceModel):
         return (
             f"moves={moves}, jump={jump:.3g}, leave={leave:.3g}, enter={enter:.3g}, "
             f"sharpness={sharpness:.3g}, off_map={float(self.off_map):.3g}, within={self.within}"
+            + f", turn={self.turn:.3g}, back={self.back:.3g}"
+            + f", speeds=[{', '.join(map(str, self.steady.speeds))}]"
             + (f", lag={self.lag}" if self.lag else "")
             + (", learns=True" if self.learns else "")
         )
-
-
-def _along(layout: Layout, rates: Rates, places: int, route_starts: Sequence[int]) -> AlongRoute:
-    unknown = States(places, route_starts=tuple(route_starts))
-    return AlongRoute(layout.states() if layout.places else unknown, rates)
-
-
-# by the dimensions of a layout
-MOTIONS: Mapping[int, Callable[[Layout, Rates, int, Sequence[int]], Motion]] = {
-    1: _along,
-    2: lambda layout, rates, *_: ByPlace(layout, rates),
-}
 
 
 def check_posterior(before: Tensor | None, places: int) -> None:

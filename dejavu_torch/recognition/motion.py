@@ -39,10 +39,10 @@ class AlongRoute(Motion):
         super().__init__(states, rates)
         _, jump, leave, enter = rates
         self.change, self.chains = speeds.change.to(rates.moves), len(speeds.change)
-        if self.chains > 1:
-            self.each = self.each * speeds.enter.to(rates.moves).repeat_interleave(
-                states.directions * states.places
-            )
+        if self.chains > 1 or self._prefers:
+            back = torch.tensor([1 - states.back, states.back] if states.directions == 2 else [1.0]).double()
+            shares = speeds.enter[:, None] * (states.share / max(1, states.places) * back)
+            self.each = shares.flatten().repeat_interleave(states.places).to(rates.moves)
         moves = speeds.beside(rates.moves) * (1 - jump - leave)[..., None, None]
         self.moves = moves[..., None, None].unbind(-3)
         last, taken = states.places - 1, rates.moves.new_zeros(states.directions, states.places)
@@ -127,9 +127,16 @@ class AlongRoute(Motion):
         """The places (..., M, D, N), and being off the map (..., 1)."""
         return state[..., :-1].unflatten(-1, (self.chains, self.states.directions, -1)), state[..., -1:]
 
-    def wide(self, places: Tensor, off: float) -> Tensor:
+    def wide(self, places: Tensor, off: float | Tensor) -> Tensor:
         wide = super().wide(places, off)
         return wide if self.chains == 1 else torch.cat([*[wide[..., :-1]] * self.chains, wide[..., -1:]], -1)
+
+    def unfolded(self, posterior: Tensor) -> Tensor:
+        """A belief in all states by one in the places and in being off the map, (N+1,) -> (S,)."""
+        shares = torch.as_tensor(self.each, dtype=posterior.dtype, device=posterior.device)
+        wide = self.wide(posterior[:-1], posterior[-1:])
+        shares = shares.expand(len(wide) - 1) * (self.states.places / self.states.share)
+        return torch.cat([wide[:-1] * shares, wide[-1:]])
 
     def folded(self, mass: Tensor) -> Tensor:
         if self.chains > 1:
@@ -211,7 +218,13 @@ class AlongRoute(Motion):
     def _differs(self) -> bool:
         """Whether it is of a kind of motion that changes what the loops compute."""
         steps = "moved", "expected", "near", "wide", "folded"
-        return any(getattr(type(self), one) is not getattr(AlongRoute, one) for one in steps)
+        own = any(getattr(type(self), one) is not getattr(AlongRoute, one) for one in steps)
+        return own or self._prefers
+
+    @property
+    def _prefers(self) -> bool:
+        """Whether one direction of travel is likelier than the other."""
+        return self.states.directions == 2 and self.states.back != 0.5
 
     def _readable(self, *tensors: Tensor) -> tuple[list[Floats], Route] | None:
         """The data of tensors, and what the loops read of the route; None if torch has to compute."""
@@ -259,7 +272,7 @@ class AlongRoute(Motion):
         (on, off), (on_after, off_after) = self._split(before), self._split(after)
         start, off, off_after = self._turned(on)[..., 0, :, :], off[..., 0], off_after[..., 0]
         total = before[..., :-1].sum(-1)
-        mean = torch.lerp(off_after, after[..., :-1].mean(-1), self.states.share)
+        mean = (self.each * after[..., :-1]).sum(-1) + (1 - self.states.share) * off_after
         _, jump, leave, enter = self.rates
         lost, kinds = torch.stack([(1 - reach).flatten() for reach in self.reach]), []
         if (found := self._counted(before, after, lost)) is not None:

@@ -69,9 +69,9 @@ class PlaneMotion(Motion):
         each = (each / each.sum(1, keepdim=True).clamp(min=MIN_PROBABILITY)).sum(0)
         return Counts(each[:-4], *each[-4:])
 
-    def wide(self, places: Tensor, off: float) -> Tensor:
-        plane = self.layout.as_plane(places.flatten(0, -2)).flatten(1)
-        return F.pad(plane, (0, 1), value=off).view(*places.shape[:-1], -1)
+    def wide(self, places: Tensor, off: float | Tensor) -> Tensor:
+        plane = self.layout.as_plane(places.reshape(-1, places.shape[-1])).flatten(1)
+        return super().wide(plane.view(*places.shape[:-1], -1), off)
 
     def folded(self, mass: Tensor) -> Tensor:
         on, off = self._split(mass)
@@ -93,26 +93,6 @@ class PlaneMotion(Motion):
         around = off.repeat(1, on.shape[1] + 2 * v, on.shape[2] + 2 * v)
         around[:, v : v + on.shape[1], v : v + on.shape[2]] = on
         return around[:, None]
-
-
-class ByPlace(PlaneMotion):
-    """The same for a filter: states are the places, in order, and being off the area."""
-
-    def moved(self, belief: Tensor) -> Tensor:
-        return self.folded(super().moved(self._wide(belief)))
-
-    def expected(self, message: Tensor) -> Tensor:
-        return self.folded(super().expected(self._wide(message)))
-
-    def anywhere(self) -> Tensor:
-        return self.folded(super().anywhere())
-
-    def counts(self, before: Tensor, after: Tensor) -> Counts:
-        return super().counts(self._wide(before), self._wide(after))
-
-    def _wide(self, states: Tensor) -> Tensor:
-        plane = self.layout.as_plane(states[..., :-1].reshape(-1, self.layout.places)).flatten(1)
-        return torch.cat([plane.view(*states.shape[:-1], -1), states[..., -1:]], -1)
 
 
 class Followed(NamedTuple):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from fractions import Fraction
 from itertools import accumulate
@@ -13,6 +14,9 @@ from torch import Tensor
 from typing_extensions import Self
 
 from dejavu_torch.recognition import chosen
+from dejavu_torch.types import expect
+
+MOST_CHAINS = 24
 
 
 class Speeds(NamedTuple):
@@ -92,16 +96,28 @@ def _moves(speed: Fraction, phase: int) -> dict[int, float]:
     return {move - 1: slip, move: 1 - 2 * slip, move + 1: slip}
 
 
-def steady(speeds: Sequence[Fraction] = chosen.STEADY) -> Speeds:
-    """Speeds of which each is kept for long, then changes to the next ones or to free motion."""
-    count, keeps, near = len(speeds), chosen.KEEPS, chosen.TO_NEXT
+def steady(speeds: Sequence[Fraction | float] = chosen.STEADY, keeps: float = chosen.KEEPS) -> Speeds:
+    """Speeds of which each is kept for long, then changes to the next ones or to free motion.
+
+    Raises:
+        InputError: speeds of 0 or less, not finite, or more than `MOST_CHAINS` in all.
+    """
+    given = [float(speed) for speed in speeds]
+    expect(all(0 < speed < math.inf for speed in given), "numbers above 0", f"the speeds are {given}")
+    known = sorted({Fraction(speed).limit_denominator(MOST_CHAINS) for speed in speeds})
+    chains = sum(map(_cycle, known))
+    seen = f"the speeds {', '.join(map(str, known))} need {chains} chains of states"
+    expect(chains <= MOST_CHAINS, f"at most {MOST_CHAINS}, as with speeds of small denominators", seen)
+    count, near = len(known), chosen.TO_NEXT
     shares = torch.zeros(count + 1, count + 1).double()
     for i in range(count):
         beside = [j for j in (i - 1, i + 1) if 0 <= j < count]
         shares[i, beside] = (1 - keeps) * near / max(1, len(beside))
         shares[i, i], shares[i, count] = keeps, (1 - keeps) * (1 - near if beside else 1)
+    if not known:
+        return FREE
     shares[count, :count], shares[count, count] = (1 - chosen.STAYS_FREE) / count, chosen.STAYS_FREE
-    return Speeds(tuple(speeds), shares)
+    return Speeds(tuple(known), shares)
 
 
 FREE = Speeds((), torch.ones(1, 1).double())
