@@ -56,10 +56,7 @@ CORRELATED = 4  # correlation times in a stretch, at least
 STEADY = tuple(map(Fraction, ("1/3", "1/2", "1", "3/2", "2", "3", "5")))  # places a query
 SLIP = 0.04  # share of the moves that are a place more or less
 KEEPS, TO_NEXT, STAYS_FREE = 0.98, 0.6, 0.9  # a speed is kept; else the next ones follow; free motion goes on
-CHANGE_COUNTS, CHANGE_ROUNDS = (
-    30.0,
-    2,
-)  # what this counts as, for each speed, beside a drive; rounds of fitting
+CHANGE_COUNTS, ASKED = 30.0, 300  # what these count as, each; queries that tell which speeds occur
 LIVE = STEADY[1:-1]  # of a filter, which cannot learn them: on all routes of `drives`, one in two and three
 KEEPS_LIVE, BACK = 0.99, 0.2  # likewise; share of the cameras that travel against the order of the places
 SELDOM = 0.2  # share of the queries at which a speed does not occur

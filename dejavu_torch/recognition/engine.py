@@ -273,12 +273,11 @@ class FittedPart(NamedTuple):
         return FittedPart(std, self.weight[..., first:last], self.still[..., first:last], self.over)
 
     def some(self, every: int) -> FittedPart:
-        """Of several stretches, one in so many; of one, so much less."""
+        """One of so many stretches, or, of a single one, so much of it."""
         if self.weight.ndim == 1:
             return self.part(0, -(-len(self.weight) // every))
-        return FittedPart(
-            self.std.map(lambda one: one[::every]), self.weight[::every], self.still[::every], self.over
-        )
+        std = self.std.map(lambda column: column[::every])
+        return FittedPart(std, self.weight[::every], self.still[::every], self.over)
 
 
 class Fit(NamedTuple):

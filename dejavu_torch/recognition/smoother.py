@@ -445,11 +445,11 @@ def blocks_together(
 
 def speeds_of(samples: Sequence[FittedPart], fit: Fit) -> Speeds:
     """The steady speeds that occur in stretches of a drive, by its evidence and free motion, and how it
-    changes between them."""
-    speeds = steady()
-    for _ in range(chosen.CHANGE_ROUNDS):
+    changes between them: of all speeds from some queries, then of those left from all."""
+    speeds, every = steady(), sum(sample.weight.numel() for sample in samples) / chosen.ASKED
+    for parts in ([sample.some(math.ceil(every)) for sample in samples], samples):
         counts = []
-        for sample in samples:
+        for sample in parts:
             motion, after = sample.over(fit.rates, speeds), None
             assert isinstance(motion, AlongRoute)
             for block in explained(sample, fit.evidence, motion):
