@@ -38,6 +38,7 @@ from dejavu_torch.recognition.calibration import confidence
 from dejavu_torch.recognition.centring import PRIOR, centred, set_apart
 from dejavu_torch.recognition.coarse import searcher
 from dejavu_torch.recognition.localizer import SINGLE, Localizer, Matching, answer
+from dejavu_torch.recognition.odometry import checked_moved, read_moved
 from dejavu_torch.recognition.querying import QUERYING, Querying, Sequences
 from dejavu_torch.recognition.scorer import Earlier, OfMap, Scorer
 from dejavu_torch.recognition.search import Scan, Search, Searcher, check_search
@@ -395,6 +396,7 @@ class DejaVu(nn.Module):
         centre: bool | None = None,
         headings: int = 1,
         shifts: Literal["auto", "none"] | Sequence[float] = "auto",
+        moved: Tensor | None = None,
     ) -> Match:
         """Section III-C: the best place of each query and whether it is accepted (eq. 5, eq. 6).
 
@@ -415,13 +417,16 @@ class DejaVu(nn.Module):
                 turned images have in common is removed, see `set_apart`.
             shifts: views of each image, moved sideways, of which the best answers, for a camera that points
                 a little further right or left than at learning; see `Querying`. `Match.shift` says how far.
+            moved: (Q,), by how many places the camera moved to each query from the one before it, as odometry
+                tells, at least 0; the first does not count. For a smoother or a filter along a route.
 
         Shape: -> Match of (Q,) on the CPU.
 
         Raises:
             InputError: no map, no frames, NaN, or features of another dimension than the map's.
         """
-        parts = [*self.matches(queries, _querying(sequence, centre, headings, shifts), progress, search)]
+        querying = _querying(sequence, centre, headings, shifts)
+        parts = [*self.matches(queries, querying, progress, search, moved=moved)]
         return Match.joined(parts)
 
     def localize_descriptors(
@@ -503,6 +508,7 @@ class DejaVu(nn.Module):
         progress: bool = False,
         search: Search | None = None,
         apart: int = 5,
+        moved: Tensor | None = None,
     ) -> Iterator[Match]:
         """As `localize`, with `top` as `candidates`, or as `loops`: one batch of queries at a time, in
         constant memory, or after the descriptors of all with a smoother, centred queries, headings, or views
@@ -531,6 +537,7 @@ class DejaVu(nn.Module):
             expect(len(queries) == self.map.places, "the traverse that the map was learned from", seen)
             check_apart(loops, len(queries))
         ordered = queries.ordered or sequence is not None if ordered is None else ordered
+        matching = matching._replace(moved=self._moved(querying.moved, moved, sequence, queries))
         whole = sequence is not None and sequence.whole
         centres = loops is None and querying.centres(whole and self.centres(len(queries)))
         centres &= whole or sequence is None
@@ -554,6 +561,19 @@ class DejaVu(nn.Module):
             return
         descriptors = self.described(queries, querying, centres, progress, on_first)
         yield answer(self.scorer(descriptors, matching), matching, progress)
+
+    def _moved(
+        self, path: Path | None, moved: Tensor | None, sequence: SequenceModel | None, queries: Traverse
+    ) -> Tensor | None:
+        """What odometry tells of queries, from a file or as given."""
+        if path is not None:
+            moved = read_moved(path)
+        if moved is None:
+            return None
+        seen = "places moved, and single images or a sequence of constant speed"
+        expect(sequence is not None and sequence.answers in ("drive", "filter"), "a drive or a filter", seen)
+        self.map.layout.expect_route("a route", "places moved, and the map of an area")
+        return checked_moved(moved, len(queries))
 
     def described(
         self,

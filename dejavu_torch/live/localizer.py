@@ -68,10 +68,12 @@ class LiveLocalizer:
     Convention: the answers equal those of `DejaVu.localize` up to rounding; without a sequence, the first 100
         of a drive know no views yet, and probabilities fall while a picture repeats. A refused frame changes
         nothing.
-        `left_out` in `localizer(frame, left_out)` is the number of frames skipped before this one: a
-        `PlaceFilter` moves once more for each. With a `PlaceFilter` that has a lag, `due(frame, left_out)`
-        gives the answers that this frame completes, none or one, in the order of the frames, and `finish()`
-        those that are left at the end; without a lag `due` has the answer of the frame itself.
+        `left_out` in `localizer(frame, left_out, moved)` is the number of frames skipped before this one: a
+        `PlaceFilter` moves once more for each. `moved` is how many places the camera moved since the frame
+        before, if odometry tells it; then the number of skipped frames does not count. With a `PlaceFilter`
+        that has a lag, `due(frame, left_out, moved)` gives the answers that this frame completes, none or
+        one, in the order of the frames, and `finish()` those that are left at the end; without a lag `due`
+        has the answer of the frame itself.
 
     Raises:
         InputError: no map, or one of even steps along the ground; a frame of another type, shape or range;
@@ -124,17 +126,24 @@ class LiveLocalizer:
     def _keep(self, scores: Tensor) -> None:
         self.scores = scores[-1] if len(scores) else self.scores
 
-    def __call__(self, frame: Tensor | np.ndarray, left_out: int = 0) -> LiveMatch:
+    def __call__(
+        self, frame: Tensor | np.ndarray, left_out: int = 0, moved: float | None = None
+    ) -> LiveMatch:
         expect(not self.lag, "due(frame)", f"an answer for each frame with a lag of {self.lag}")
-        return self.due(frame, left_out)[0]
+        return self.due(frame, left_out, moved)[0]
 
     @torch.no_grad()
-    def due(self, frame: Tensor | np.ndarray, left_out: int = 0) -> list[LiveMatch]:
+    def due(
+        self, frame: Tensor | np.ndarray, left_out: int = 0, moved: float | None = None
+    ) -> list[LiveMatch]:
         """The answers that a frame completes: its own, or that of the frame `lag` before, if there is one."""
+        if moved is not None:
+            expect(self._filters, "a PlaceFilter", f"moved {moved:g} without a filter")
+            expect(0 <= moved < math.inf, "a finite number of places, at least 0", f"moved is {moved:g}")
         with self._localizer.alone_asked():
-            return self._due(frame, left_out)
+            return self._due(frame, left_out, moved)
 
-    def _due(self, frame: Tensor | np.ndarray, left_out: int) -> list[LiveMatch]:
+    def _due(self, frame: Tensor | np.ndarray, left_out: int, moved: float | None) -> list[LiveMatch]:
         start, mean, latest = time.perf_counter(), self._mean, self._latest
         batch = as_batch(frame, self.model.map.device)
         with in_one_thread(batch.numel() if self._small else math.inf):
@@ -148,7 +157,10 @@ class LiveLocalizer:
                 raw, (descriptor, mean) = descriptor, self.centring(descriptor, mean, len(descriptor))
                 latest = raw, descriptor
         with in_one_thread(self.model.map.places):
-            self._localizer.skip(min(left_out, MAX_SKIPPED))
+            if moved is None:
+                self._localizer.skip(min(left_out, MAX_SKIPPED))
+            else:
+                self._localizer.moved = torch.tensor([moved], dtype=torch.float64)
             match = self._localizer(descriptor)
         self._mean, self._latest = mean, latest
         return self._told(match, start)

@@ -210,6 +210,8 @@ def _seen(
         if alone := {1: along, 2: _of_flight}[layout.dimensions]:
             seen = f"a motion of one's own, and {len(scorer)} queries on {layout.places} places"
             expect(smoother.motion is AlongRoute, "a route of fewer places", seen)
+            seen = f"moved, and {len(scorer)} queries on {layout.places} places"
+            expect(smoother.moved is None, "a filter, or a route of fewer places", seen)
             fitted_one(1)
             yield from ((i, known, seen) for known, seen in alone(asked, progress))
             continue
@@ -223,7 +225,7 @@ def _seen(
             smoother.states(layout.places, layout.starts),
             len(smoother.move_logits),
             smoother.motion,
-            id(smoother.steady),
+            id(smoother.steady if smoother.moved is None else smoother.moved),
         )
         fitted.setdefault(kind, []).append((i, asked, smoother.drive(scorer.rows, descriptors, spacing)))
     for (queries, states, *_), alike in fitted.items():

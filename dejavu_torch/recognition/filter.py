@@ -15,7 +15,7 @@ from typing_extensions import Self
 from dejavu_torch.memory import is_plain, without_autocast
 from dejavu_torch.places.layout import ROUTE, Layout
 from dejavu_torch.places.states import States
-from dejavu_torch.recognition import chosen
+from dejavu_torch.recognition import chosen, odometry
 from dejavu_torch.recognition.engine import MIN_PROBABILITY, Motion, Rates
 from dejavu_torch.recognition.motion import AlongRoute, checked_rates, logits
 from dejavu_torch.recognition.online import Learned
@@ -58,7 +58,9 @@ class FilterState(NamedTuple):
         posterior: (N+1,), of the latest answer, which with a lag depends on later queries as well.
         learned: what the queries so far tell, if the filter learns.
         waiting: (R,N), scores of the queries that wait for their answers.
-        left_out: after each of these, how many queries were left out. absent: (R,), see `PlaceFilter.step`.
+        left_out: after each of these, how many queries were left out. told: (R,2), how much speaks for being
+            off the map, and places moved, NaN where unknown; see `PlaceFilter.step`.
+        ahead: (), of a place, by which the camera is ahead of whole places moved.
     """
 
     belief: Tensor
@@ -66,14 +68,15 @@ class FilterState(NamedTuple):
     learned: Learned | Followed | None
     waiting: Tensor
     left_out: tuple[int, ...]
-    absent: Tensor
+    told: Tensor
+    ahead: Tensor
 
     def to(self, like: Tensor) -> FilterState:
         """The same, of the type and on the device of a tensor."""
         learned = self.learned and type(self.learned)(*(one.to(like) for one in self.learned))
-        rows = self.belief, self.posterior, self.waiting, self.absent
-        belief, posterior, waiting, absent = (one.to(like) for one in rows)
-        return FilterState(belief, posterior, learned, waiting, self.left_out, absent)
+        rows = self.belief, self.posterior, self.waiting, self.told
+        belief, posterior, waiting, told = (one.to(like) for one in rows)
+        return FilterState(belief, posterior, learned, waiting, self.left_out, told, self.ahead)
 
 
 class PlaceFilter(SequenceModel):
@@ -177,7 +180,8 @@ class PlaceFilter(SequenceModel):
         new = self.off_map.detach().new_zeros
         kind, moves, states = self._learned, len(self.move_logits), self._states(places)
         learned = None if kind is None else kind.unpacked(new(kind.size(places, moves)), places, moves)
-        return FilterState(new(states), new(places + 1), learned, new(0, places), (), new(0))
+        none = new(0, places), (), new(0, 2), torch.zeros((), dtype=torch.float64)
+        return FilterState(new(states), new(places + 1), learned, *none)
 
     @property
     def _ways(self) -> int:
@@ -206,8 +210,8 @@ class PlaceFilter(SequenceModel):
         places, rows = self._places(state.shape[-1]), state.reshape(-1, state.shape[-1])
         kind, learned = self._learned, rows[1:].flatten()
         known = None if kind is None else kind.unpacked(learned, places, len(self.move_logits))
-        none = state.new_zeros(0, places)
-        return FilterState(rows[0], state.new_zeros(places + 1), known, none, (), none[:, 0])
+        none = state.new_zeros(0, places), (), state.new_zeros(0, 2), state.new_zeros(())
+        return FilterState(rows[0], state.new_zeros(places + 1), known, *none)
 
     def forward(self, scores: Tensor, before: Tensor | None = None) -> Tensor:
         if scores.ndim > 2:
@@ -240,14 +244,20 @@ class PlaceFilter(SequenceModel):
         route_starts: Sequence[int] = (0,),
         last: bool = False,
         absent: Tensor | None = None,
+        moved: Tensor | None = None,
     ) -> tuple[Tensor, FilterState]:
         """As of every `SequenceModel`.
 
         Args:
             last: no queries follow, so all that wait are answered. absent: (B,), nats that speak for being
                 off the map, by what is known of each query beside its scores; none by default.
+            moved: (B,), places from the query before to each, as odometry tells, NaN where unknown; along a
+                route.
         """
-        posteriors, answered, state = self._answers(scores, state, route_starts, last, absent)
+        told: Tensor | None = None  # neither in an exported graph
+        if absent is not None or moved is not None:
+            told = torch.stack([_or(absent, len(scores), 0.0), _or(moved, len(scores), math.nan)], 1)
+        posteriors, answered, state = self._answers(scores, state, route_starts, last, told)
         return self.near(posteriors[:, :-1], answered), state
 
     def finish(self, state: FilterState, route_starts: Sequence[int] = (0,)) -> tuple[Tensor, FilterState]:
@@ -280,7 +290,7 @@ class PlaceFilter(SequenceModel):
         state: FilterState,
         route_starts: Sequence[int] = (0,),
         last: bool = False,
-        absent: Tensor | None = None,
+        told: Tensor | None = None,
     ) -> tuple[Tensor, Tensor, FilterState]:
         """Posteriors (A,N+1) of the queries whose answers are due, or of all, their scores (A,N), and the
         next state."""
@@ -295,14 +305,17 @@ class PlaceFilter(SequenceModel):
         if state.posterior.shape != (places + 1,) or len(state.belief) != self._states(places):
             shapes = f"the posterior is {tuple(state.posterior.shape)}; expected {(places + 1,)}"
             raise InputError(f"{shapes} for this map")
-        belief, posterior, learned, waiting, left, known_absent = state.to(scores)
-        absent = scores.new_zeros(len(scores)) if absent is None else absent.to(scores)
-        absent = torch.cat([known_absent, absent])
+        belief, posterior, learned, waiting, left, known, camera = state.to(scores)
+        unknown = scores.new_tensor([0.0, math.nan]).expand(len(scores), 2)
+        odometry_known = told is not None or len(known) > 0
+        told = torch.cat([known, unknown if told is None else told.to(scores)])
+        absent = told[:, 0]
         left_out = (*left, *[0] * len(scores))
         scores = torch.cat([waiting, scores]) if len(waiting) else scores
         moments, motion = moments_of(scores), self.motion(scores, route_starts, learned)
         likelihoods = scores if learned else self.likelihoods(scores, moments, None, absent)  # else in turn
         posteriors, due = [], len(scores) if last else max(0, len(scores) - self.lag)
+        by_odometry = self._by_odometry(motion, told[:, 1], camera) if odometry_known else None
         for t in range(due):
             ahead = slice(t, t + 1 + self.lag)
             seen = likelihoods[ahead]
@@ -311,13 +324,14 @@ class PlaceFilter(SequenceModel):
                 some = Moments(*(one[ahead] for one in moments))
                 seen = self.likelihoods(scores[ahead], some, learned, absent[ahead])
             seen = motion.wide(seen[:, :-1], seen[:, -1:])
-            expected = motion.moved(belief)
+            motions = [motion] * len(seen) if by_odometry is None else by_odometry[0][ahead]
+            expected = motions[0].moved(belief)
             if t == 0:
                 expected = torch.where((belief == 0).all(), motion.anywhere(), expected)
             before, belief = belief, updated(expected, seen[0])
             posterior = belief
             if self.lag:
-                posterior = updated(belief, self._message(motion, seen, left_out[ahead]))
+                posterior = updated(belief, self._message(motion, motions, seen, left_out[ahead]))
             posteriors.append(motion.folded(posterior))
             if learned is not None:
                 z = (moments.mean[t] - scores[t]).where(moments.valid[t], 0) / moments.spread[t]
@@ -327,16 +341,32 @@ class PlaceFilter(SequenceModel):
                 belief = motion.moved(belief)
         answers = torch.stack(posteriors) if posteriors else scores.new_zeros(0, places + 1)
         latest = answers[-1] if posteriors else posterior
-        after = FilterState(belief, latest, learned, scores[due:], left_out[due:], absent[due:])
+        camera = camera if by_odometry is None else by_odometry[1][due]
+        after = FilterState(belief, latest, learned, scores[due:], left_out[due:], told[due:], camera)
         return answers, scores[:due], after
 
-    def _message(self, motion: Motion, likelihoods: Tensor, left_out: Sequence[int]) -> Tensor:
-        """What the queries after the first one say of it, (R,N+1) -> (N+1,)."""
+    @staticmethod
+    def _by_odometry(motion: Motion, moved: Tensor, ahead: Tensor) -> tuple[list[Motion], list[Tensor]]:
+        """The motion to each query, of which some have places moved, and by how much of a place the camera is
+        ahead before each and after all."""
+        places, aheads = odometry.whole(moved, float(ahead))
+        fits = isinstance(motion, AlongRoute) or not any(one is not None for one in places)
+        expect(fits, "a route", "places moved, and the map of an area")
+        if not isinstance(motion, AlongRoute):
+            return [motion] * len(places), aheads
+        told = {one: odometry.Told(motion, one) for one in {*places} if one is not None}
+        return [motion if one is None else told[one] for one in places], aheads
+
+    def _message(
+        self, motion: Motion, motions: Sequence[Motion], likelihoods: Tensor, left_out: Sequence[int]
+    ) -> Tensor:
+        """What the queries after the first one say of it, (R,S) -> (S,), by the motion to each."""
         message = torch.ones_like(likelihoods[0])
         for t in range(len(likelihoods) - 1, 0, -1):
             message = message * likelihoods[t]
             message = message / message.amax().clamp(min=MIN_PROBABILITY)
-            for _ in range(1 + left_out[t - 1]):
+            message = motions[t].expected(message)
+            for _ in range(left_out[t - 1]):
                 message = motion.expected(message)
         return message
 
@@ -397,6 +427,14 @@ class PlaceFilter(SequenceModel):
             + (f", lag={self.lag}" if self.lag else "")
             + (", learns=True" if self.learns else "")
         )
+
+
+def _or(told: Tensor | None, queries: int, default: float) -> Tensor:
+    """What is told of each of some queries, (B,), or a default."""
+    told = torch.full((queries,), default) if told is None else torch.as_tensor(told).detach()
+    seen = f"what is told of {queries} queries is {tuple(told.shape)}"
+    expect(told.shape == (queries,), "a number of each", seen)
+    return told.to(torch.float64)
 
 
 def check_posterior(before: Tensor | None, places: int) -> None:

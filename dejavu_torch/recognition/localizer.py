@@ -52,6 +52,7 @@ class Matching(NamedTuple):
     callback: Callable[[Tensor], None] | None = None  # receives the final scores (B,N)
     search: Search = "auto"  # of single queries, see `DejaVu.localize`
     wrappers: tuple[Callable[[Scorer], Scorer], ...] = ()  # of the scores, from inside out
+    moved: Tensor | None = None  # places from each query to the next, (Q,), see `checked_moved`
 
     def as_it_drives(self) -> Matching:
         """The same for one drive whose queries come one after another."""
@@ -104,6 +105,8 @@ class Localizer:
         # probabilities, each by itself, of queries that a filter has yet to answer
         self.alone = torch.empty(0, dtype=torch.float64)
         self.last: Tensor | None = None  # the latest query
+        none = torch.empty(0, dtype=torch.float64)
+        self.moved = none if matching.moved is None else matching.moved  # to the next queries
         self.run = 0  # how many have repeated one picture up to it, see `repeats`
         self.stale = torch.empty(0, dtype=torch.int64)  # likewise, of queries that wait for their answers
         self.searcher = searcher
@@ -215,10 +218,17 @@ class Localizer:
             self.alone = torch.cat([self.alone, alone])
         size = max(1, CACHED // scores.shape[1])
         absent = torch.zeros(len(scores)) if absent is None else absent
+        moved = self._moved(len(scores))
         with in_one_thread(scores.shape[1]):
-            pairs = zip(scores.split(size), absent.split(size), strict=True)
-            match = Match.joined(self._in_sequence(part, stored, absent=one) for part, one in pairs)
+            told = zip(absent.split(size), moved.split(size), strict=True)
+            pairs = zip(scores.split(size), told, strict=True)
+            match = Match.joined(self._in_sequence(part, stored, False, *one) for part, one in pairs)
         return match if odds is None else self._doubted(match, odds[len(odds) - len(match.index) :])
+
+    def _moved(self, count: int) -> Tensor:
+        """How far the camera moved to each of the next queries, NaN where nothing tells it."""
+        known, self.moved = self.moved[:count], self.moved[count:]
+        return torch.cat([known, torch.full((count - len(known),), math.nan, dtype=known.dtype)])
 
     def _told(self, match: Match, scorer: Scorer, queries: Tensor) -> Match:
         """The match of queries with what copies tell of them, if these answer now."""
@@ -282,9 +292,11 @@ class Localizer:
         stored: Tensor | None = None,
         last: bool = False,
         absent: Tensor | None = None,
+        moved: Tensor | None = None,
     ) -> Match:
         states = self.states or {T: m.start(scores.shape[1]) for T, m in self.models.items()}
-        told: dict[str, dict[str, Any]] = {"filter": {} if absent is None else {"absent": absent}}
+        known = {} if absent is None else {"absent": absent, "moved": moved}
+        told: dict[str, dict[str, Any]] = {"filter": known}
         steps = {
             T: m.step(scores, states[T], self.route_starts, **told.get(m.answers, {}))
             for T, m in self.models.items()
@@ -385,6 +397,7 @@ def _as_it_drives(scorer: Scorer, matching: Matching, progress: bool, verb: str)
 def _of_drive(scorer: Scorer, smoother: PlaceSmoother, matching: Matching, progress: bool) -> Match:
     """Match all queries of a drive."""
     scorer = wrapped(scorer, matching)
+    smoother = smoother if matching.moved is None else smoother.changed(moved=matching.moved)
     asked = DriveQuery(scorer, smoother, matching.k or 1, matching.radius, matching.platt)
     (answers,) = answer_drives([asked], progress)
     match, acceptance = answers.match, matching.acceptance

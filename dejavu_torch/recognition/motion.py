@@ -38,6 +38,7 @@ class AlongRoute(Motion):
     def __init__(self, states: States, rates: Rates, speeds: Speeds = FREE) -> None:
         super().__init__(states, rates)
         _, jump, leave, enter = rates
+        self.speeds = speeds
         self.change, self.chains = speeds.change.to(rates.moves), len(speeds.change)
         if self.chains > 1 or self._prefers:
             back = torch.tensor([1 - states.back, states.back] if states.directions == 2 else [1.0]).double()

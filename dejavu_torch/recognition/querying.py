@@ -6,6 +6,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
+from pathlib import Path
 from typing import Literal
 
 from typing_extensions import Self
@@ -105,6 +106,8 @@ class Querying(Sequences):
             before each frame, and all after it
         headings: tried per image on the map of an area, evenly over 360 degrees, such as 24, which takes 24
             times as long
+        moved: odometry, for a drive or a filter: csv with a column moved, in places since the frame before,
+            and a row for each frame
         views: what `shifts` have come to, see `DejaVu.looking`.
     """
 
@@ -114,6 +117,7 @@ class Querying(Sequences):
     top: int | None = None
     loops: int | None = None
     headings: int = 1
+    moved: Path | None = None
     views: Views = field(default=ALONE, metadata=PYTHON)
 
     def order(self, matcher: SequenceModel | Literal["auto"] | None) -> bool | None:
@@ -156,7 +160,7 @@ class Querying(Sequences):
         if self.loops is not None:
             together = self.way not in (None, "drive", "single") and self.way
             own = {"centre": self.centre, "top": self.top, "headings": self.headings != 1 and self.headings}
-            refuse_with(f"--loops {self.loops}", match=together, **own, **others)
+            refuse_with(f"--loops {self.loops}", match=together, moved=self.moved, **own, **others)
 
 
 SEQUENCES = Sequences()

@@ -14,7 +14,7 @@ from typing_extensions import Self
 
 from dejavu_torch.places.layout import Layout
 from dejavu_torch.places.states import Link, States
-from dejavu_torch.recognition import chosen
+from dejavu_torch.recognition import chosen, odometry
 from dejavu_torch.recognition.engine import (
     Block,
     Counts,
@@ -24,6 +24,7 @@ from dejavu_torch.recognition.engine import (
     Motion,
     Rates,
     explained,
+    forward,
     learn,
     nats,
     size_of,
@@ -72,6 +73,8 @@ class PlaceSmoother(SequenceModel):
         loop: the last place leads to the first one.
         motion: a kind of motion of one's own along a route, which is made of `States` and `Rates`; not for
             large maps, which are searched in parts.
+        moved: (Q,), how many places the camera moved to each query of a drive from the one before it, as
+            odometry tells; the first does not count.
 
     Shape: scores (..., Q, N) -> (..., Q, N), -log of a probability in nats. Descriptors (Q,K), where given,
         tell how the queries depend on each other; else the scores tell it.
@@ -111,6 +114,7 @@ class PlaceSmoother(SequenceModel):
         links: Sequence[Link] = (),
         loop: bool = False,
         motion: type[Motion] = AlongRoute,
+        moved: Tensor | None = None,
     ) -> None:
         super().__init__()
         moves = checked_rates(moves, jump, leave, enter)
@@ -127,7 +131,7 @@ class PlaceSmoother(SequenceModel):
         self.enter_logit = nn.Parameter(logits(enter)[0] - logits(1 - enter)[0])
         self.turn, self.separation, self.tempering = turn, float(separation), float(tempering)
         self.within, self.threshold = within, threshold
-        self.links, self.loop, self.motion = tuple(links), loop, motion
+        self.links, self.loop, self.motion, self.moved = tuple(links), loop, motion, moved
         self.map_links: tuple[Link, ...] = ()  # those of the map
         self.removed = 1.0  # share of each place's mean score that is removed
         self.log_likelihood: float | None = None  # nats above being off the map throughout, as fitted
@@ -263,7 +267,7 @@ class PlaceSmoother(SequenceModel):
                 std, table = standardised(given, means), RankTable()
                 table.add(std.z, std.only(std.speaks[:, None].expand_as(std.z), False))
                 values = table.values
-        return Drive(rows, means, values, spacing, self.separation, self.tempering, presence)
+        return Drive(rows, means, values, spacing, self.separation, self.tempering, presence, self.moved)
 
     def blocks(
         self, drive: Drive, route_starts: Sequence[int] = (0,), size: int | None = None
@@ -338,7 +342,7 @@ class PlaceSmoother(SequenceModel):
         best = first_that_explains(fits, moving, different)
         nats_per_query = like.tempering * best.held / max(1.0, different)
         is_drive, speeds = moves_along(best.held, nats_per_query), FREE
-        if is_drive and self.motion is AlongRoute:
+        if is_drive and self.motion is AlongRoute and self.moved is None:
             speeds = speeds_of(samples, best)
         jump, leave, enter = map(float, best.rates[1:])
         learned = {
@@ -404,7 +408,7 @@ class Drive(NamedTuple):
     """What a smoother knows of the queries of a drive.
 
     means: (N,), mean score of each place. values: of the rank table. presence: how near queries come to the
-    map, if single images were asked.
+    map, if single images were asked. moved: (Q,), see `PlaceSmoother`.
     """
 
     rows: Rows
@@ -414,6 +418,7 @@ class Drive(NamedTuple):
     separation: float
     tempering: float
     presence: Presence | None = None
+    moved: Tensor | None = None
 
     def log_likelihood(self, numbers: Tensor) -> Tensor:
         """Log likelihood of the places for some queries, 0 being off the map: (B,) -> (B,N)."""
@@ -432,6 +437,9 @@ def blocks_together(
     rates = (smoother.rates(mean) for (smoother, _), mean in zip(drives, means, strict=True))
     first = drives[0][0]
     together = Rates(*map(torch.stack, zip(*rates, strict=True)))
+    if any(drive.moved is not None for _, drive in drives):
+        yield from _by_odometry(drives, first.states(places, route_starts), together, size)
+        return
     motion = first.over_states(first.states(places, route_starts), together)
 
     def likelihood(first: int, last: int) -> Tensor:
@@ -441,6 +449,38 @@ def blocks_together(
 
     still = torch.stack([drive.spacing.stopped for _, drive in drives]).to(means[0].device)
     yield from sweep(motion, likelihood, queries, still, size or size_of(motion, still))
+
+
+def _by_odometry(
+    drives: Sequence[tuple[PlaceSmoother, Drive]], states: States, rates: Rates, size: int | None
+) -> Iterator[Block]:
+    """As `blocks_together`, of one drive whose moves are known but for their scale."""
+    ((_, drive),), motion = drives, odometry.moving(states, rates)
+    assert drive.moved is not None
+
+    def likelihood(steps: odometry.Steps, first: int, last: int) -> Tensor:
+        numbers = steps.queries[first:last]
+        known, log = numbers >= 0, drive.means.new_zeros(last - first, len(drive.means))
+        log[known] = drive.log_likelihood(numbers[known])
+        return motion.wide(log.exp()[None], 1.0)
+
+    def log_of(steps: odometry.Steps) -> float:
+        still = steps.still[None].to(drive.means.device)
+        numbers = range(0, still.shape[1], size_of(motion, still))
+        return sum(
+            float(part.log.sum()) for part in forward(motion, partial(likelihood, steps), numbers, still)
+        )
+
+    steps = max((odometry.steps_of(scale * drive.moved) for scale in chosen.SCALES), key=log_of)
+    still = steps.still[None].to(drive.means.device)
+    size = size or size_of(motion, still)
+    for block in sweep(motion, partial(likelihood, steps), still.shape[1], still, size):
+        numbers = steps.queries[block.first : block.first + block.log.shape[-1]]
+        known = numbers >= 0
+        if known.any():
+            _, before, like, after, log, _ = block
+            before, like, after = before[:, known], like[:, known], after[:, known]
+            yield Block(int(numbers[known][0]), before, like, after, log[:, known], motion)
 
 
 def speeds_of(samples: Sequence[FittedPart], fit: Fit) -> Speeds:

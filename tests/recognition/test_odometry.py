@@ -1,0 +1,200 @@
+"""How far a camera moved, where odometry tells it: held against literal sums, and used end to end."""
+
+from __future__ import annotations
+
+import csv
+import math
+
+import numpy as np
+import pytest
+import torch
+from command_line import run
+from helpers import refused
+from hypothesis import given
+from hypothesis import strategies as st
+from reference import Steps, forward_backward
+from test_smoother import noise, shown
+
+from dejavu_torch import DejaVu, LiveLocalizer, PlaceFilter, PlaceSmoother, SequenceMatcher
+from dejavu_torch.places.states import States
+from dejavu_torch.recognition import chosen, odometry
+from dejavu_torch.recognition.engine import Rates
+from dejavu_torch.recognition.motion import AlongRoute
+from dejavu_torch.recognition.speeds import FREE, steady
+
+SLIP = chosen.ODOMETRY / 2
+ONE = (SLIP, 1 - 2 * SLIP, SLIP)
+
+
+def test_a_drive_in_steps_of_one_place():
+    steps = odometry.steps_of(torch.tensor([0.0, 1, 0, 3, 0.4, 0.4, 0.4]))
+    assert steps.queries.tolist() == [0, 1, 2, -1, -1, 3, 4, 5, 6]
+    assert steps.still.tolist() == [True, False, True, False, False, False, True, False, True]
+
+
+@given(st.lists(st.floats(0, 3), min_size=1, max_size=8), st.integers(0, 99))
+def test_a_smoother_takes_steps_of_one_place(moved, seed):
+    """Forward-backward over all steps; those on the way say nothing."""
+    moved = torch.tensor(moved).double()
+    moved[0] = 0
+    scores = noise(len(moved), 5, seed=seed).double()
+    smoother = PlaceSmoother(moved=moved).double()
+    steps, drive = odometry.steps_of(moved), smoother.drive(scores)
+    log = drive.log_likelihood(torch.arange(len(moved)))
+    rows = [log[i].tolist() if i >= 0 else [0.0] * 5 for i in steps.queries.tolist()]
+    jump, leave, enter = 0.001, 0.001, 0.01
+    with torch.no_grad():
+        known, _ = forward_backward(
+            Steps(5, ONE, jump, leave, enter, smoother.turn), rows, steps.still.tolist()
+        )
+    states = torch.tensor(known)[steps.queries >= 0]
+    there, back = states[:, :-1].chunk(2, 1)
+    expected = torch.cat([there + back.flip(1), states[:, -1:]], 1).double()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(chosen, "SCALES", (1.0,))
+        torch.testing.assert_close(smoother.posterior(scores), expected, atol=1e-5, rtol=1e-4)
+
+
+@given(st.integers(0, 4), st.sampled_from([FREE, steady([1]), steady([0.5, 2])]), st.integers(1, 2))
+def test_a_step_of_so_many_places(places, speeds, directions):
+    """Any speed that was kept before tells nothing of it."""
+    states = States(6, directions, turn=0.1)
+    rates = Rates(*(torch.tensor(one).double() for one in ([0.2, 0.8], 0.01, 0.02, 0.1)))
+    motion = AlongRoute(states, rates, speeds)
+    told = odometry.Told(motion, places)
+    size = len(motion.anywhere())
+    matrix = told.moved(torch.eye(size).double())
+    torch.testing.assert_close(told.expected(torch.eye(size).double()), matrix.mT)
+    torch.testing.assert_close(matrix.sum(1), torch.ones(size).double())
+    moves = [1.0]
+    for _ in range(places):
+        longer = [0.0] * (len(moves) + 2)
+        for i, share in enumerate(moves):
+            for j, part in enumerate(ONE):
+                longer[i + j] += share * part
+        moves = longer
+    literal = torch.tensor(Steps(6, moves, 0.01, 0.02, 0.1, 0.1, directions).transitions()).double()
+    own = torch.eye(6 * directions).double().repeat(motion.chains, 1)
+    own = torch.block_diag(own, torch.ones(1, 1).double())  # of each state, that of a single chain
+    torch.testing.assert_close(matrix @ own, own @ literal)
+
+
+def irregular(frames, places):
+    """A drive that moves on by 0 to 4 places, and its moves."""
+    draw = torch.Generator().manual_seed(3)
+    moved = torch.randint(0, 5, (frames,), generator=draw)
+    moved[0] = 0
+    at = moved.cumsum(0)
+    kept = at < places
+    return at[kept], moved[kept].double()
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("lag", [0, 3])
+def test_a_filter_is_told_of_moves_in_batches_of_any_size(lag):
+    at, moved = irregular(60, 120)
+    moved = moved + 0.3
+    scores, filter = shown(120, at.tolist(), clear=2.0), PlaceFilter(lag=lag)
+    found = []
+    for size in (1, 7, 60):
+        state, answers = filter.start(120), []
+        for rows, told in zip(scores.split(size), moved.split(size), strict=True):
+            own, state = filter.step(rows, state, moved=told)
+            answers.append(own)
+        answers.append(filter.finish(state)[0])
+        found.append(torch.cat(answers))
+    torch.testing.assert_close(found[0], found[1], rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(found[0], found[2], rtol=1e-4, atol=1e-5)
+
+
+@torch.no_grad()
+def test_where_nothing_is_told_a_filter_moves_as_without():
+    scores, filter = shown(50, [*range(40)]), PlaceFilter()
+    unknown = torch.full((40,), math.nan)
+    found, _ = filter.step(scores, filter.start(50), moved=unknown)
+    torch.testing.assert_close(found, filter.step(scores, filter.start(50))[0])
+
+
+@pytest.fixture(scope="module")
+def route():
+    """Descriptors that say little each."""
+    return torch.randn(300, 32, generator=torch.Generator().manual_seed(0))
+
+
+@pytest.fixture(scope="module")
+def model(route):
+    return DejaVu(whitening="none").learn(route)
+
+
+@pytest.mark.parametrize("scale", [1.0, 1.1])
+def test_a_drive_of_irregular_speed_is_found_by_its_moves(model, route, scale):
+    at, moved = irregular(150, 300)
+    queries = route[at] + 1.5 * torch.randn(len(at), 32, generator=torch.Generator().manual_seed(1))
+
+    def found(**told):
+        match = model.localize(queries, sequence=PlaceSmoother(within=2), centre=False, **told)
+        return float(((match.index - at).abs() <= 2).double().mean())
+
+    assert found(moved=scale * moved) > 0.95
+    assert found(moved=scale * moved) > found() + 0.1
+
+
+def test_a_filter_and_a_live_one_follow_the_moves(model, route):
+    at, moved = irregular(150, 300)
+    queries = route[at] + 1.2 * torch.randn(len(at), 32, generator=torch.Generator().manual_seed(1))
+    told = model.localize(queries, sequence=PlaceFilter(), moved=moved)
+    plain = model.localize(queries, sequence=PlaceFilter())
+    right = [float(((one.index - at).abs() <= 2).double().mean()) for one in (told, plain)]
+    assert right[0] > max(0.8, right[1])
+    live = LiveLocalizer(model, PlaceFilter())
+    found = [live(row, moved=places).place for row, places in zip(queries, moved.tolist(), strict=True)]
+    assert found == told.index.tolist()
+
+
+def test_a_csv_of_moves(model, route, tmp_path):
+    at, moved = irregular(150, 300)
+    queries = route[at] + 1.2 * torch.randn(len(at), 32, generator=torch.Generator().manual_seed(1))
+    np.save(tmp_path / "query.npy", queries.numpy())
+    model.save(tmp_path / "map.safetensors")
+    with (tmp_path / "moved.csv").open("w", newline="") as file:
+        csv.writer(file).writerows([("frame", "moved"), *enumerate(moved.tolist())])
+    command = ["localize", tmp_path / "map.safetensors", tmp_path / "query.npy", "--match", "filter"]
+    run(*command, "--moved", tmp_path / "moved.csv", "--out", tmp_path / "run")
+    with (tmp_path / "run" / "matches.csv").open() as file:
+        found = [int(row["place"]) for row in csv.DictReader(file)]
+    assert found == model.localize(queries, sequence=PlaceFilter(), moved=moved).index.tolist()
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("", ["columns", "a column moved"]),
+        ("x,y\n1,2\n", ["columns x, y", "a column moved"]),
+        ("moved\n", ["0 rows", "a column moved"]),
+        ("moved\n1\nfar\n", ["line 3", "'far'", "a number"]),
+        ("frame,moved\n1\n", ["line 2", "''", "a number"]),
+    ],
+)
+def test_a_csv_without_moves_is_refused(text, told, tmp_path):
+    path = tmp_path / "moved.csv"
+    path.write_text(text)
+    with refused(*told):
+        odometry.read_moved(path)
+
+
+def test_what_cannot_be_moves_is_refused(model, route, tmp_path):
+    queries, fits = route[:20], torch.ones(20)
+    smoother = PlaceSmoother()
+    with refused("moved is (19,) for 20 queries", "as many"):
+        model.localize(queries, sequence=smoother, moved=fits[1:])
+    with refused("moved is -1 at query 3", "at least 0"):
+        model.localize(queries, sequence=smoother, moved=torch.where(torch.arange(20) == 3, -1.0, 1.0))
+    with refused("moved is 475.9", "at most 100"):
+        model.localize(queries, sequence=smoother, moved=501 * fits)
+    for sequence in (None, SequenceMatcher(3)):
+        with refused("places moved, and single images", "a drive or a filter"):
+            model.localize(queries, sequence=sequence, moved=fits)
+    with refused("moved 1 without a filter", "PlaceFilter"):
+        LiveLocalizer(model, None)(route[0], moved=1.0)
+    with refused("moved is inf", "at least 0"):
+        LiveLocalizer(model)(route[0], moved=math.inf)
