@@ -331,6 +331,7 @@ class Chained(NamedTuple):
     speeds: Sequence[tuple[int, int]]
     shares: Sequence[Row]
     slip: float
+    first: Row  # shares of what comes from elsewhere
 
     @property
     def places(self):
@@ -355,8 +356,7 @@ class Chained(NamedTuple):
 
     def enters(self):
         """How much of what comes from elsewhere each chain gets."""
-        count = len(self.speeds)
-        return [0.5 if i == count else 0.5 / count / q for i, _, _, q in self.chains()]
+        return [self.first[i] / q for i, _, _, q in self.chains()]
 
     def transitions(self):
         chains, size = self.chains(), self.places * self.directions

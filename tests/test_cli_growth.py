@@ -74,8 +74,8 @@ def test_merged_routes_are_listed_and_matches_name_them(merged, tmp_path, capsys
     run("localize", merged, query, "--match", "single", "--out", tmp_path / "m.csv")
     assert "--route ROUTE" in capsys.readouterr().out
     rows = rows_of(tmp_path / "m.csv")
-    columns = ["query", "place", "score", "accepted", "confidence", "route", "query_name", "place_name"]
-    assert [*rows[0]] == columns
+    columns = ["query", "place", "score", "accepted", "confidence", "stale", "route"]
+    assert [*rows[0]] == [*columns, "query_name", "place_name"]
     right = [row["route"] == "other" and abs(int(row["query"]) - int(row["place"])) <= 5 for row in rows]
     assert sum(right) > 48
     other = "--truth=0", "--route", "other", "--out", tmp_path / "e"
@@ -87,7 +87,7 @@ def test_merged_routes_are_listed_and_matches_name_them(merged, tmp_path, capsys
         assert (report["route"], report["accepted"]) == ("other", 96)
     run("localize", merged, query, "--match", "single", "--out", tmp_path / "top.csv", "--top", "5")
     top = rows_of(tmp_path / "top.csv")
-    assert [*top[0]][5:7] == ["rank", "route"]
+    assert [*top[0]][5:8] == ["stale", "rank", "route"]
     assert [row["route"] for row in top[::5]] == [row["route"] for row in rows]
     run("evaluate", tmp_path / "top.csv", *other)
     assert report_of(tmp_path / "e")["recall_at_5"] >= report["recall_at_1"]

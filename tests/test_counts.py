@@ -84,8 +84,8 @@ def compared(reference, query, truth):
 RUNS = {  # searched, scored, moved, described
     "single": (localized(lambda: None), (1450, 100, 0, 451)),
     "filter": (localized(PlaceFilter), (1300, 250, 150, 451)),
-    "drive": (localized(PlaceSmoother), (1300, 1152, 1192, 451)),
-    "compare": (compared(*ROUTE, "0"), (1450, 3104, 12678, 903)),
+    "drive": (localized(PlaceSmoother), (1300, 1152, 1341, 451)),
+    "compare": (compared(*ROUTE, "0"), (1450, 3104, 14019, 903)),
     "compare of an area": (compared(*AREA, None), (58, 1400, 9608, 765)),
 }
 

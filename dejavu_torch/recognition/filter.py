@@ -161,7 +161,7 @@ class PlaceFilter(SequenceModel):
         self.log_sharpness = nn.Parameter(torch.tensor(float(sharpness), dtype=torch.float32).log())
         self.off_map = nn.Parameter(torch.tensor(float(off_map), dtype=torch.float32))
         self.within, self.threshold, self.lag, self.learns = within, threshold, lag, learns
-        self.turn, self.back, self.steady = turn, back, steady(speeds, chosen.KEEPS_LIVE)
+        self.turn, self.back, self.steady = turn, back, steady(speeds, chosen.KEEPS_LIVE, chosen.USUAL)
         self.layout = ROUTE  # of the places, see `over`
 
     def over(self, layout: Layout) -> Self:

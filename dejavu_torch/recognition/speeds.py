@@ -28,10 +28,12 @@ class Speeds(NamedTuple):
     Attributes:
         speeds: in places a query, ascending.
         shares: (n+1,n+1), of each speed, and of the free motion, that goes on as each of them.
+        first: (n+1,), share of each of a camera that comes from elsewhere.
     """
 
     speeds: tuple[Fraction, ...]
     shares: Tensor
+    first: Tensor
 
     @property
     def owners(self) -> Tensor:
@@ -54,12 +56,9 @@ class Speeds(NamedTuple):
 
     @property
     def enter(self) -> Tensor:
-        """The share of each chain of a camera that comes from elsewhere, (M,): half moves freely."""
-        owners, count = self.owners, len(self.speeds)
-        if not count:
-            return torch.ones(1).double()
-        size = owners.bincount()[owners[:-1]]
-        return F.pad(0.5 / (count * size.double()), (0, 1), value=0.5)
+        """The share of each chain of a camera that comes from elsewhere, (M,)."""
+        owners = self.owners
+        return (self.first / owners.bincount())[owners]
 
     def beside(self, free: Tensor) -> Tensor:
         """The moves of all chains, (...,V+1) of the free motion -> (...,M,W+1)."""
@@ -81,7 +80,7 @@ class Speeds(NamedTuple):
         kept[-1] = True
         shares = (found + chosen.CHANGE_COUNTS * self.shares.to(found))[kept][:, kept]
         speeds = tuple(speed for speed, keeps in zip(self.speeds, kept[:-1].tolist(), strict=True) if keeps)
-        return self._replace(speeds=speeds, shares=shares / shares.sum(1, keepdim=True))
+        return self._replace(speeds=speeds, shares=shares / shares.sum(1, keepdim=True), first=_first(speeds))
 
 
 def _cycle(speed: Fraction) -> int:
@@ -96,8 +95,22 @@ def _moves(speed: Fraction, phase: int) -> dict[int, float]:
     return {move - 1: slip, move: 1 - 2 * slip, move + 1: slip}
 
 
-def steady(speeds: Sequence[Fraction | float] = chosen.STEADY, keeps: float = chosen.KEEPS) -> Speeds:
-    """Speeds of which each is kept for long, then changes to the next ones or to free motion.
+def _first(speeds: Sequence[Fraction], usual: float = 0.0) -> Tensor:
+    """Half of the cameras that come from elsewhere move freely, or as many of the rest as at one place a
+    query, which `usual` of them do."""
+    shares = torch.full((len(speeds) + 1,), 0.5 / max(1, len(speeds))).double()
+    shares[-1] = 0.5
+    if usual and 1 in speeds:
+        shares[:-1] = (1 - 2 * usual) / max(1, len(speeds) - 1)
+        shares[[speeds.index(Fraction(1)), -1]] = usual
+    return shares / shares.sum()
+
+
+def steady(
+    speeds: Sequence[Fraction | float] = chosen.STEADY, keeps: float = chosen.KEEPS, usual: float = 0.0
+) -> Speeds:
+    """Speeds of which each is kept for long, then changes to the next ones or to free motion; `usual` of the
+    cameras come at one place a query, and as many move freely.
 
     Raises:
         InputError: speeds of 0 or less, not finite, or more than `MOST_CHAINS` in all.
@@ -117,7 +130,7 @@ def steady(speeds: Sequence[Fraction | float] = chosen.STEADY, keeps: float = ch
     if not known:
         return FREE
     shares[count, :count], shares[count, count] = (1 - chosen.STAYS_FREE) / count, chosen.STAYS_FREE
-    return Speeds(tuple(known), shares)
+    return Speeds(tuple(known), shares, _first(known, usual))
 
 
-FREE = Speeds((), torch.ones(1, 1).double())
+FREE = Speeds((), torch.ones(1, 1).double(), torch.ones(1).double())

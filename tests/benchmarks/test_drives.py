@@ -159,13 +159,18 @@ def test_other_constants_are_tried_and_put_back(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(chosen, "ROUTES", {"walk": (route, "{data}/c.npy")})
     monkeypatch.setattr(chosen, "HALVED", ("SHARPENED", "ROUNDS"))
     before = vars(constants).copy()
-    benchmark("chosen", tmp_path, "--constants", "ROUNDS", "FAST", "--out", tmp_path / "out")
+    benchmark("chosen", tmp_path, "--constants", "SHARPENED", "FAST", "--out", tmp_path / "out")
     rows = json.loads((tmp_path / "out" / "bench.json").read_text())["rows"]
-    assert [row["contender"] for row in rows] == ["as it is", "ROUNDS 5: 2", "ROUNDS 5: 10", "FAST: none"]
+    assert [row["contender"] for row in rows] == [
+        "as it is",
+        "SHARPENED 0.6: 0.3",
+        "SHARPENED 0.6: 1.2",
+        "FAST: none",
+    ]
     assert rows[0]["lost"] == rows[0]["gained"] == 0
-    assert len({row["auc"] for row in rows}) > 1
+    assert len({row["calibration_error"] for row in rows}) > 1
     assert vars(constants) == before
-    assert "ROUNDS 5: 10" in capsys.readouterr().out
+    assert "SHARPENED 0.6: 1.2" in capsys.readouterr().out
 
 
 def test_drives_leave_the_map_stand_still_and_see_it_otherwise(tmp_path, monkeypatch, capsys):

@@ -34,7 +34,7 @@ def literal(filter_, scores):
     steps = Steps(places, moves, jump, leave, enter, **ways)
     if keeps.speeds:
         speeds = [(speed.numerator, speed.denominator) for speed in keeps.speeds]
-        steps = Chained(steps, speeds, keeps.shares.tolist(), chosen.SLIP)
+        steps = Chained(steps, speeds, keeps.shares.tolist(), chosen.SLIP, keeps.first.tolist())
     matrix, belief, found = steps.transitions(), steps.start(), []
     states = range(len(belief))
     for t, row in enumerate(scores):

@@ -42,8 +42,9 @@ def steps_of(draw):
 def motion_of(steps):
     speeds = FREE
     if isinstance(steps, Chained):
-        shares = torch.tensor(steps.shares, dtype=torch.float64)
-        steps, speeds = steps.steps, Speeds(tuple(Fraction(*one) for one in steps.speeds), shares)
+        known = tuple(Fraction(*one) for one in steps.speeds)
+        columns = (torch.tensor(one, dtype=torch.float64) for one in (steps.shares, steps.first))
+        steps, speeds = steps.steps, Speeds(known, *columns)
     rates = (torch.tensor(one, dtype=torch.float64) for one in steps[1:5])
     states = States(steps.places, steps.directions, tuple(steps.starts), tuple(steps.links), steps.turn)
     return AlongRoute(states, Rates(*rates), speeds)
@@ -53,8 +54,10 @@ def motion_of(steps):
 def chained(draw):
     """Steps, mostly with steady speeds beside free moves."""
     speeds = draw(st.sampled_from([(), ((1, 1),), ((1, 2), (3, 1)), ((1, 3), (2, 3), (3, 2))]))
-    steps, shares = draw(steps_of()), steady([Fraction(*one) for one in speeds]).shares if speeds else None
-    return steps if shares is None else Chained(steps, speeds, shares.tolist(), chosen.SLIP)
+    steps, known = draw(steps_of()), steady([Fraction(*one) for one in speeds], usual=0.3)
+    if not speeds:
+        return steps
+    return Chained(steps, speeds, known.shares.tolist(), chosen.SLIP, known.first.tolist())
 
 
 def matrix_of(steps):

@@ -55,7 +55,8 @@ def steps_of(smoother, places, starts=(0,)):
         links += tuple((end - 1, start, 1.0) for start, end in zip(starts, ends, strict=True))
     steps = Steps(places, moves, jump, leave, enter, smoother.turn, 2, starts, links)
     speeds = [(speed.numerator, speed.denominator) for speed in smoother.steady.speeds]
-    return Chained(steps, speeds, smoother.steady.shares.tolist(), chosen.SLIP) if speeds else steps
+    shares, first = smoother.steady.shares.tolist(), smoother.steady.first.tolist()
+    return Chained(steps, speeds, shares, chosen.SLIP, first) if speeds else steps
 
 
 SMOOTHER = st.builds(
