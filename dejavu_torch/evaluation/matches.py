@@ -108,7 +108,7 @@ def write_matches(
                     "place": number,
                     "score": f"{score:.{digits}g}",
                     "accepted": int(good),
-                    "probability": _number(chance),
+                    "probability": _probability(chance),
                     "confidence": _number(margin),
                     "heading": _number(north),
                     "shift": _number(shift, 3),
@@ -126,6 +126,11 @@ def write_matches(
                     paired.write(f"{row['query_name']} {row['place_name']}\n")
                 accepted += good and order == 1
     return total, accepted
+
+
+def _probability(value: float) -> str:
+    """As many digits as tell how far it is from 1."""
+    return _number(value, 6 - round(math.log10(max(1 - value, 1e-9))) if value > 0.5 else 6)
 
 
 def _number(value: float, digits: int = 6) -> str:

@@ -324,7 +324,8 @@ class PlaceFilter(SequenceModel):
                 some = Moments(*(one[ahead] for one in moments))
                 seen = self.likelihoods(scores[ahead], some, learned, absent[ahead])
             seen = motion.wide(seen[:, :-1], seen[:, -1:])
-            motions = [motion] * len(seen) if by_odometry is None else by_odometry[0][ahead]
+            moves = [None] * len(seen) if by_odometry is None else by_odometry[0][ahead]
+            motions = [one or motion for one in moves]
             expected = motions[0].moved(belief)
             if t == 0:
                 expected = torch.where((belief == 0).all(), motion.anywhere(), expected)
@@ -335,8 +336,8 @@ class PlaceFilter(SequenceModel):
             posteriors.append(motion.folded(posterior))
             if learned is not None:
                 z = (moments.mean[t] - scores[t]).where(moments.valid[t], 0) / moments.spread[t]
-                moves = motion.counts(before[None], seen[:1]).moves
-                learned = learned.after(z, moments.varied[t, 0], motion.folded(expected)[:-1], moves)
+                made = motion.counts(before[None], seen[:1]).moves
+                learned = learned.after(z, moments.varied[t, 0], motion.folded(expected)[:-1], made)
             for _ in range(left_out[t]):
                 belief = motion.moved(belief)
         answers = torch.stack(posteriors) if posteriors else scores.new_zeros(0, places + 1)
@@ -346,16 +347,19 @@ class PlaceFilter(SequenceModel):
         return answers, scores[:due], after
 
     @staticmethod
-    def _by_odometry(motion: Motion, moved: Tensor, ahead: Tensor) -> tuple[list[Motion], list[Tensor]]:
-        """The motion to each query, of which some have places moved, and by how much of a place the camera is
-        ahead before each and after all."""
+    def _by_odometry(
+        motion: Motion, moved: Tensor, ahead: Tensor
+    ) -> tuple[Sequence[Motion | None], list[Tensor]]:
+        """The motion to each query of which the places moved are known, and by how much of a place the camera
+        is ahead before each and after all."""
         places, aheads = odometry.whole(moved, float(ahead))
-        fits = isinstance(motion, AlongRoute) or not any(one is not None for one in places)
-        expect(fits, "a route", "places moved, and the map of an area")
+        known = {one for one in places if one is not None}
+        if not known:
+            return [None] * len(places), aheads
         if not isinstance(motion, AlongRoute):
-            return [motion] * len(places), aheads
-        told = {one: odometry.Told(motion, one) for one in {*places} if one is not None}
-        return [motion if one is None else told[one] for one in places], aheads
+            raise InputError("places moved, and the map of an area; expected a route")
+        told = {one: odometry.Told(motion, one) for one in known}
+        return [None if one is None else told[one] for one in places], aheads
 
     def _message(
         self, motion: Motion, motions: Sequence[Motion], likelihoods: Tensor, left_out: Sequence[int]

@@ -16,6 +16,7 @@ from reference import Steps, forward_backward
 from test_smoother import noise, shown
 
 from dejavu_torch import DejaVu, LiveLocalizer, PlaceFilter, PlaceSmoother, SequenceMatcher
+from dejavu_torch.places.layout import Layout
 from dejavu_torch.places.states import States
 from dejavu_torch.recognition import chosen, odometry
 from dejavu_torch.recognition.engine import Rates
@@ -201,3 +202,15 @@ def test_what_cannot_be_moves_is_refused(model, route, tmp_path):
         LiveLocalizer(model, None)(route[0], moved=1.0)
     with refused("moved is inf", "at least 0"):
         LiveLocalizer(model)(route[0], moved=math.inf)
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("filter", [PlaceFilter(learns=True), PlaceFilter().over(Layout(5, 10))])
+def test_a_filter_that_learns_its_moves_still_does(filter):
+    """Where something else is told of each query."""
+    scores = shown(50, [t // 3 for t in range(90)])
+    found, _ = filter.step(scores, filter.start(50), absent=torch.zeros(90))
+    torch.testing.assert_close(found, filter.step(scores, filter.start(50))[0])
+    if filter.layout.dimensions == 2:
+        with refused("places moved, and the map of an area", "a route"):
+            filter.step(scores, filter.start(50), moved=torch.ones(90))
