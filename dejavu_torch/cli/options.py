@@ -75,9 +75,12 @@ class LocalQuerying(Querying):
     Args:
         fov: horizontal field of view of the camera in degrees: tell by how many of them it points further
             right than at learning
+        moved: odometry, for a drive or a filter: csv with a column moved, in places since the frame before,
+            and a row for each frame
     """
 
     fov: float | None = None
+    moved: Path | None = None
 
 
 @dataclass(frozen=True)

@@ -106,8 +106,6 @@ class Querying(Sequences):
             before each frame, and all after it
         headings: tried per image on the map of an area, evenly over 360 degrees, such as 24, which takes 24
             times as long
-        moved: odometry, for a drive or a filter: csv with a column moved, in places since the frame before,
-            and a row for each frame
         views: what `shifts` have come to, see `DejaVu.looking`.
     """
 
@@ -117,7 +115,7 @@ class Querying(Sequences):
     top: int | None = None
     loops: int | None = None
     headings: int = 1
-    moved: Path | None = None
+    moved: Path | None = field(default=None, metadata=PYTHON)
     views: Views = field(default=ALONE, metadata=PYTHON)
 
     def order(self, matcher: SequenceModel | Literal["auto"] | None) -> bool | None:
