@@ -290,11 +290,11 @@ def draw_posterior(run: Localization, cells: int = PIXELS) -> plots.Pictures:
     block, width = -(-len(queries) // cells), -(-(len(borders) - 1) // cells)
     x = torch.cat([queries[::block], queries[-1:] + 1]) - 0.5
     y = torch.cat([borders[:-1:width], borders[-1:]]) - 0.5
-    values, off, before = torch.zeros(len(x) - 1, len(y) - 1), torch.zeros(len(queries)), None
+    values, off, state = torch.zeros(len(x) - 1, len(y) - 1), torch.zeros(len(queries)), None
     for indices, scores in _score_rows(run, torch.arange(len(queries))):
         with torch.no_grad():
-            posterior = run.sequence.posterior(scores, before)
-        before, off[indices] = posterior[-1], posterior[:, -1]
+            posterior, state = run.sequence.followed(scores, state)
+        off[indices] = posterior[:, -1]
         pooled = max_pool1d(posterior[:, :-1], width, ceil_mode=True)
         values.scatter_reduce_(0, (indices // block)[:, None].expand_as(pooled), pooled, "amax")
     figure, (axis, below) = plots.canvas(5.2, 2, sharex=True, height_ratios=(4, 1))

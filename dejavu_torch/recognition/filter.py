@@ -237,6 +237,12 @@ class PlaceFilter(SequenceModel):
             state = state._replace(belief=belief, posterior=before)
         return self._answers(scores, state, last=True)[0]
 
+    def followed(self, scores: Tensor, state: FilterState | None = None) -> tuple[Tensor, FilterState]:
+        """As `posterior`, from the state after the queries before, and the next state."""
+        start = self.start(scores.shape[-1]) if state is None else state
+        found, _, state = self._answers(scores, start, last=True)
+        return found, state
+
     def step(
         self,
         scores: Tensor,
