@@ -107,6 +107,8 @@ def test_stores_are_asked_three_ways_from_the_same_scores(monkeypatch):
     ours = next(row for row in table if row[0] == "walk: **dejavu**")
     areas = [found["dejavu 1", answer]["auc"] for answer in ANSWERS]
     assert ours[3] == " ".join(f"{area:.3f}".removeprefix("0") for area in areas)
+    assert table[-1][0] == "walk: dejavu, recall@1 of the drive"
+    assert table[-1][3] == f"{found['dejavu 1', 'drive']['recall_at_1']:.3f}".removeprefix("0")
 
 
 def test_drives_over_other_ground_are_told_by_map():
