@@ -218,10 +218,9 @@ def drive_table(rows: Sequence[Row]) -> list[list[str]]:
             if any(cells):
                 table.append([f"{case}: {name}", *cells])
         table.append([f"{case}: dejavu, recall@1 of the drive"])
+        ours = [row for row in found["drive"][OURS] if row["recall_at_1"] is not None]
         for size in (*SHOWN, math.inf):
-            fits = [
-                row for row in found["drive"][OURS] if row["route_bytes_per_place"] <= NEAR * LARGER * size
-            ]
+            fits = [row for row in ours if row["route_bytes_per_place"] <= NEAR * LARGER * size]
             most = max((row["recall_at_1"] for row in fits), default=None)
             table[-1].append("" if most is None else f"{most:.3f}".lstrip("0"))
     return table
