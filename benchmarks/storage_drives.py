@@ -217,8 +217,10 @@ def drive_table(rows: Sequence[Row]) -> list[list[str]]:
                 cells.append(" ".join(f"{area:.3f}".lstrip("0") for area in areas if area is not None))
             if any(cells):
                 table.append([f"{case}: {name}", *cells])
+        ours = [row for row in found["drive"][OURS] if row.get("recall_at_1") is not None]
+        if not ours:
+            continue
         table.append([f"{case}: dejavu, recall@1 of the drive"])
-        ours = [row for row in found["drive"][OURS] if row["recall_at_1"] is not None]
         for size in (*SHOWN, math.inf):
             fits = [row for row in ours if row["route_bytes_per_place"] <= NEAR * LARGER * size]
             most = max((row["recall_at_1"] for row in fits), default=None)

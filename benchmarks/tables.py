@@ -56,7 +56,8 @@ def stored(bench: dict[str, Any]) -> dict[str, Any]:
     rows = [{k: v for k, v in row.items() if v is not None and k not in left_out} for row in bench["rows"]]
     for row in rows:
         if "family" in row:  # of a store: the curve suffices
-            for name in ("sequences", "bytes", "route_bytes", "peak_bytes", "recall_at_1"):
+            recall = () if row.get("answer") == "drive" else ("recall_at_1",)
+            for name in ("sequences", "bytes", "route_bytes", "peak_bytes", *recall):
                 row.pop(name, None)
     facts = {name: of for name, of in bench.items() if name not in ("rows", *left_out)}
     return facts | {"rows": rounded(rows)}
