@@ -135,8 +135,8 @@ MUTANTS = [
         "In a PlaceFilter what drives off the end of the map is off the map afterwards: the prediction "
         "adds up to 1.",
         "dejavu_torch/recognition/motion.py",
-        "self._turned(self.lost).flatten(-2) + leave",
-        "0 * self.lost.flatten(-2) + leave",
+        "self._began(self.lost).flatten(-3) + leave",
+        "0 * self.lost.flatten(-3) + leave",
         ("tests/recognition/test_filter.py::-k literal_loop or drives_off",),
     ),
     Mutant(

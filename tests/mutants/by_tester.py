@@ -600,8 +600,8 @@ MUTANTS = [
     Mutant(
         "The message of a query goes backwards through the turn as well.",
         "dejavu_torch/recognition/motion.py",
-        "moved = self._turned(self._by_all_moves(on, back=True)).flatten(-2)",
-        "moved = self._by_all_moves(on, back=True).flatten(-2)",
+        "moved = self._began(self._by_all_moves(on, back=True)).flatten(-3)",
+        "moved = self._by_all_moves(on, back=True).flatten(-3)",
         ("tests/recognition/test_motion.py::test_a_step_is_that_of_the_matrix_and_keeps_the_mass",),
     ),
     Mutant(
@@ -1174,8 +1174,8 @@ MUTANTS = [
     Mutant(
         "A smoother moves as the motion that it was given.",
         "dejavu_torch/recognition/smoother.py",
-        "motion = first.motion(",
-        "motion = AlongRoute(",
+        "if self.steady.speeds else self.motion(states, rates)",
+        "if self.steady.speeds else AlongRoute(states, rates)",
         ("tests/recognition/test_engine.py::-k as_it_is_told",),
     ),
     Mutant(
@@ -1226,5 +1226,40 @@ MUTANTS = [
         "length > max(chosen.WAIT, 3 * int(length.median()))",
         "length > chosen.WAIT",
         ("tests/test_loops.py::-k coordinates",),
+    ),
+    Mutant(
+        "A speed of a fraction goes through its cycle of moves.",
+        "dejavu_torch/recognition/speeds.py",
+        "following = first + (at - first + 1) % size[owners] == at[:, None]",
+        "following = at == at[:, None]",
+        ("tests/recognition/test_motion.py::test_a_step_is_that_of_the_matrix_and_keeps_the_mass",),
+    ),
+    Mutant(
+        "A drive keeps the speeds that occur in it.",
+        "dejavu_torch/recognition/speeds.py",
+        "kept = found.sum(0) >= chosen.SELDOM * found.sum()",
+        "kept = found.sum(0) < chosen.SELDOM * found.sum()",
+        ("tests/recognition/test_speeds.py",),
+    ),
+    Mutant(
+        "A filter follows a camera that travels back.",
+        "dejavu_torch/recognition/filter.py",
+        "directions = self.layout, like.shape[-1], 2 if self.back else 1",
+        "directions = self.layout, like.shape[-1], 1",
+        ("tests/recognition/test_speeds.py", "tests/recognition/test_filter.py::-k literal"),
+    ),
+    Mutant(
+        "What odometry tells is known of the query that it is told of.",
+        "dejavu_torch/recognition/odometry.py",
+        "at = places.clamp(min=1).cumsum(0) - 1",
+        "at = places.clamp(min=1).cumsum(0) - places.clamp(min=1)",
+        ("tests/recognition/test_odometry.py",),
+    ),
+    Mutant(
+        "A whole drive finds the scale of its odometry.",
+        "dejavu_torch/recognition/smoother.py",
+        "for scale in chosen.SCALES), key=log_of)",
+        "for scale in (1.0,)), key=log_of)",
+        ("tests/recognition/test_odometry.py::-k irregular",),
     ),
 ]
