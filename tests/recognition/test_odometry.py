@@ -143,6 +143,19 @@ def test_a_drive_of_irregular_speed_is_found_by_its_moves(model, route, scale):
     assert sure > unsure + 0.02
 
 
+@torch.no_grad()
+@pytest.mark.parametrize("scale", [0.87, 1.15])
+def test_a_whole_drive_finds_the_scale_of_its_odometry(scale):
+    path = torch.arange(0, 280, 2)
+    scores = shown(300, path.tolist(), clear=1.0)
+
+    def sure(moved):
+        smoother = PlaceSmoother(separation=2.0, moved=torch.full((140,), moved))
+        return float(smoother.posterior(scores, noise(140, 16)).gather(1, path[:, None]).mean())
+
+    assert sure(2 * scale) > 0.85 * sure(2.0)
+
+
 def test_a_filter_and_a_live_one_follow_the_moves(model, route):
     at, moved = irregular(150, 300)
     queries = route[at] + 1.2 * torch.randn(len(at), 32, generator=torch.Generator().manual_seed(1))
