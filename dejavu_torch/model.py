@@ -37,6 +37,8 @@ from dejavu_torch.places.layout import ROUTE, Layout
 from dejavu_torch.recognition.calibration import confidence
 from dejavu_torch.recognition.centring import PRIOR, centred, set_apart
 from dejavu_torch.recognition.coarse import searcher
+from dejavu_torch.recognition.drive import FEWER
+from dejavu_torch.recognition.large import is_large
 from dejavu_torch.recognition.localizer import SINGLE, Localizer, Matching, answer
 from dejavu_torch.recognition.odometry import checked_moved, read_moved
 from dejavu_torch.recognition.querying import QUERYING, Querying, Sequences
@@ -425,8 +427,8 @@ class DejaVu(nn.Module):
         Raises:
             InputError: no map, no frames, NaN, or features of another dimension than the map's.
         """
-        querying = _querying(sequence, centre, headings, shifts)
-        parts = [*self.matches(queries, querying, progress, search, moved=moved)]
+        querying = replace(_querying(sequence, centre, headings, shifts), moved=moved)
+        parts = [*self.matches(queries, querying, progress, search)]
         return Match.joined(parts)
 
     def localize_descriptors(
@@ -508,7 +510,6 @@ class DejaVu(nn.Module):
         progress: bool = False,
         search: Search | None = None,
         apart: int = 5,
-        moved: Tensor | None = None,
     ) -> Iterator[Match]:
         """As `localize`, with `top` as `candidates`, or as `loops`: one batch of queries at a time, in
         constant memory, or after the descriptors of all with a smoother, centred queries, headings, or views
@@ -537,7 +538,8 @@ class DejaVu(nn.Module):
             expect(len(queries) == self.map.places, "the traverse that the map was learned from", seen)
             check_apart(loops, len(queries))
         ordered = queries.ordered or sequence is not None if ordered is None else ordered
-        matching = matching._replace(moved=self._moved(querying.moved, moved, sequence, queries))
+        moved = self._moved(querying.moved, sequence, queries)
+        matching = matching._replace(moved=moved, ordered=bool(ordered))
         whole = sequence is not None and sequence.whole
         centres = loops is None and querying.centres(whole and self.centres(len(queries)))
         centres &= whole or sequence is None
@@ -563,17 +565,21 @@ class DejaVu(nn.Module):
         yield answer(self.scorer(descriptors, matching), matching, progress)
 
     def _moved(
-        self, path: Path | None, moved: Tensor | None, sequence: SequenceModel | None, queries: Traverse
+        self, told: Path | Tensor | None, sequence: SequenceModel | None, queries: Traverse
     ) -> Tensor | None:
         """What odometry tells of queries, from a file or as given."""
-        if path is not None:
-            moved = read_moved(path)
-        if moved is None:
+        if told is None:
             return None
+        moved = read_moved(told) if isinstance(told, Path) else told
+        expect(self.step is None, "a map of frames as they are", "places moved, and a map of even steps")
         seen = "places moved, and single images or a sequence of constant speed"
-        expect(sequence is not None and sequence.answers in ("drive", "filter"), "a drive or a filter", seen)
+        if sequence is None or sequence.answers not in ("drive", "filter"):
+            raise InputError(f"{seen}; expected a drive or a filter")
         self.map.layout.expect_route("a route", "places moved, and the map of an area")
-        return checked_moved(moved, len(queries))
+        moved = checked_moved(moved, len(queries))
+        seen = f"places moved, and {len(queries)} queries on {self.map.places} places"
+        expect(not sequence.whole or not is_large(len(queries), self.map.places), FEWER, seen)
+        return moved
 
     def described(
         self,

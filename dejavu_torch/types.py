@@ -269,8 +269,8 @@ class Match:
             NaN where nothing tells it; of the first candidate. None unless views of the queries are compared.
         shift_degrees: the same in degrees, if the camera's field of view is known.
         stale: int64, how many queries in a row, up to this one, repeat the picture of the one before them,
-            bit by bit, as of a stream that has stalled: the camera may have moved on. None if only scores
-            are known.
+            bit by bit, as of a stream that has stalled: the camera may have moved on. None if the
+            queries are in no order.
         sequences: by T, matches (Q,) of the same queries in sequences, a filter or a smoother, for reports;
             mostly empty.
         smoother: of a whole drive, the `PlaceSmoother` as it was fitted to the queries, which tells whether

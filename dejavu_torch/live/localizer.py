@@ -17,6 +17,7 @@ from dejavu_torch.features.hog import HOG
 from dejavu_torch.features.pixels import PatchPixels
 from dejavu_torch.memory import in_one_thread
 from dejavu_torch.model import DejaVu, check_queries
+from dejavu_torch.recognition import odometry
 from dejavu_torch.recognition.centring import running_mean, set_apart
 from dejavu_torch.recognition.filter import PlaceFilter
 from dejavu_torch.recognition.querying import SEQUENCES, Sequences
@@ -66,8 +67,7 @@ class LiveLocalizer:
         scores: (N,) of the latest answer, on the model's device; None before the first, or if not kept.
 
     Convention: the answers equal those of `DejaVu.localize` up to rounding; without a sequence, the first 100
-        of a drive know no views yet, and probabilities fall while a picture repeats. A refused frame changes
-        nothing.
+        of a drive know no views yet. A refused frame changes nothing.
         `left_out` in `localizer(frame, left_out, moved)` is the number of frames skipped before this one: a
         `PlaceFilter` moves once more for each. `moved` is how many places the camera moved since the frame
         before, if odometry tells it; then the number of skipped frames does not count. With a `PlaceFilter`
@@ -121,7 +121,8 @@ class LiveLocalizer:
         matching, self._driven = self.model.matching(self.sequence), self._views.as_it_drives(describes=True)
         keep = self._keep if self.keep_scores else None
         wrappers = () if self._views == ALONE else (self._driven,)
-        self._localizer = self.model.localizer(matching._replace(callback=keep, wrappers=wrappers))
+        matching = matching._replace(callback=keep, wrappers=wrappers, ordered=True)
+        self._localizer = self.model.localizer(matching)
 
     def _keep(self, scores: Tensor) -> None:
         self.scores = scores[-1] if len(scores) else self.scores
@@ -139,7 +140,8 @@ class LiveLocalizer:
         """The answers that a frame completes: its own, or that of the frame `lag` before, if there is one."""
         if moved is not None:
             expect(self._filters, "a PlaceFilter", f"moved {moved:g} without a filter")
-            expect(0 <= moved < math.inf, "a finite number of places, at least 0", f"moved is {moved:g}")
+            self.model.map.layout.expect_route("a route", "moved, and the map of an area")
+            odometry.check_move(moved)
         with self._localizer.alone_asked():
             return self._due(frame, left_out, moved)
 
@@ -160,7 +162,7 @@ class LiveLocalizer:
             if moved is None:
                 self._localizer.skip(min(left_out, MAX_SKIPPED))
             else:
-                self._localizer.moved = torch.tensor([moved], dtype=torch.float64)
+                self._localizer.told(moved)
             match = self._localizer(descriptor)
         self._mean, self._latest = mean, latest
         return self._told(match, start)

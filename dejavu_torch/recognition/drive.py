@@ -36,6 +36,7 @@ from dejavu_torch.text import progress_of
 from dejavu_torch.types import Match, expect
 
 SCORES_KEPT = 2**26  # scores of drives that are smoothed together, up to which they are computed once
+FEWER = "a route of fewer places, or, along one, a filter"
 NORMAL = 1.4826  # standard deviations of a Gaussian over its median absolute deviation
 
 
@@ -210,8 +211,8 @@ def _seen(
         if alone := {1: along, 2: _of_flight}[layout.dimensions]:
             seen = f"a motion of one's own, and {len(scorer)} queries on {layout.places} places"
             expect(smoother.motion is AlongRoute, "a route of fewer places", seen)
-            seen = f"moved, and {len(scorer)} queries on {layout.places} places"
-            expect(smoother.moved is None, "a filter, or a route of fewer places", seen)
+            seen = f"places moved, and {len(scorer)} queries on {layout.places} places"
+            expect(smoother.moved is None, FEWER, seen)
             fitted_one(1)
             yield from ((i, known, seen) for known, seen in alone(asked, progress))
             continue
@@ -225,7 +226,7 @@ def _seen(
             smoother.states(layout.places, layout.starts),
             len(smoother.move_logits),
             smoother.motion,
-            id(smoother.steady if smoother.moved is None else smoother.moved),
+            id(smoother.steady) if smoother.moved is None else -i,  # each by itself
         )
         fitted.setdefault(kind, []).append((i, asked, smoother.drive(scorer.rows, descriptors, spacing)))
     for (queries, states, *_), alike in fitted.items():

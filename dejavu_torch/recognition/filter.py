@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from fractions import Fraction
 from typing import NamedTuple
 
@@ -190,12 +190,12 @@ class PlaceFilter(SequenceModel):
 
     def _places(self, states: int) -> int:
         """How many places a belief in so many states is of."""
-        return self.layout.places if self.layout.dimensions == 2 else (states - 1) // self._ways
+        return self.layout.places or (states - 1) // self._ways
 
     def _states(self, places: int) -> int:
         """How many states a belief has."""
         layout = self.layout
-        return 1 + (layout.rows * layout.columns if layout.dimensions == 2 else self._ways * places)
+        return 1 + {1: self._ways * places, 2: layout.rows * layout.columns}[layout.dimensions]
 
     def packed(self, state: FilterState) -> Tensor:
         """The state of a filter without a lag: its belief (S,), or, if it learns, that and what is learned
@@ -309,13 +309,16 @@ class PlaceFilter(SequenceModel):
             own = f"those of the map's {self.layout.places} places"
             raise InputError(f"scores are {tuple(scores.shape)}; expected {own}")
         if state.posterior.shape != (places + 1,) or len(state.belief) != self._states(places):
-            shapes = f"the posterior is {tuple(state.posterior.shape)}; expected {(places + 1,)}"
-            raise InputError(f"{shapes} for this map")
+            shapes = f"the posterior is {tuple(state.posterior.shape)}, of {len(state.belief)} states"
+            own = f"({places + 1},), and {self._states(places)} states, for this map and filter"
+            raise InputError(f"{shapes}; expected {own}")
         belief, posterior, learned, waiting, left, known, camera = state.to(scores)
         unknown = scores.new_tensor([0.0, math.nan]).expand(len(scores), 2)
         odometry_known = told is not None or len(known) > 0
         told = torch.cat([known, unknown if told is None else told.to(scores)])
         absent = told[:, 0]
+        if odometry_known and len(told) and not bool(belief.any()):
+            told[0, 1] = math.nan  # there is no query before the first
         left_out = (*left, *[0] * len(scores))
         scores = torch.cat([waiting, scores]) if len(waiting) else scores
         moments, motion = moments_of(scores), self.motion(scores, route_starts, learned)
@@ -407,9 +410,14 @@ class PlaceFilter(SequenceModel):
         moves, (_, jump, leave) = (one.to(like).softmax(0) for one in (self.move_logits, self.rate_logits))
         moves = moves if learned is None else learned.moves_after(moves)
         rates = Rates(moves, jump, leave, self.enter_logit.to(like).sigmoid())
-        if self.layout.dimensions == 2:
-            return PlaneMotion(self.layout, rates)
-        layout, places, directions = self.layout, like.shape[-1], 2 if self.back else 1
+        kinds: dict[int, Callable[[], Motion]] = {
+            1: lambda: self._along(rates, like.shape[-1], route_starts),
+            2: lambda: PlaneMotion(self.layout, rates),
+        }
+        return kinds[self.layout.dimensions]()
+
+    def _along(self, rates: Rates, places: int, route_starts: Sequence[int]) -> Motion:
+        layout, directions = self.layout, 2 if self.back else 1
         states = layout.states() if layout.places else States(places, route_starts=tuple(route_starts))
         states = states._replace(directions=directions, turn=self.turn, back=self.back)
         return AlongRoute(states, rates, FREE if self.learns else self.steady)
@@ -441,7 +449,7 @@ class PlaceFilter(SequenceModel):
 
 def _or(told: Tensor | None, queries: int, default: float) -> Tensor:
     """What is told of each of some queries, (B,), or a default."""
-    told = torch.full((queries,), default) if told is None else torch.as_tensor(told).detach()
+    told = torch.full((queries,), default) if told is None else torch.as_tensor(told).detach().cpu()
     seen = f"what is told of {queries} queries is {tuple(told.shape)}"
     expect(told.shape == (queries,), "a number of each", seen)
     return told.to(torch.float64)

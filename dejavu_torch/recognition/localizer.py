@@ -52,6 +52,7 @@ class Matching(NamedTuple):
     callback: Callable[[Tensor], None] | None = None  # receives the final scores (B,N)
     search: Search = "auto"  # of single queries, see `DejaVu.localize`
     wrappers: tuple[Callable[[Scorer], Scorer], ...] = ()  # of the scores, from inside out
+    ordered: bool = False  # single images, too: one that repeats is of a stream that has stalled
     moved: Tensor | None = None  # places from each query to the next, (Q,), see `checked_moved`
 
     def as_it_drives(self) -> Matching:
@@ -159,6 +160,8 @@ class Localizer:
         they get less sure from the second repeat on, as videos of another rate repeat one."""
         count, shape = len(match), (-1, *[1] * (match.index.ndim - 1))
         stale, self.stale = self.stale[:count].view(shape).expand_as(match.index), self.stale[count:]
+        if not self.models and not self.matching.ordered:
+            return match
         probability, accepted = match.probability, match.accepted
         if not self.models and probability is not None:
             probability = probability * AGES ** (stale - 1).clamp(min=0)
@@ -224,6 +227,10 @@ class Localizer:
             pairs = zip(scores.split(size), told, strict=True)
             match = Match.joined(self._in_sequence(part, stored, False, *one) for part, one in pairs)
         return match if odds is None else self._doubted(match, odds[len(odds) - len(match.index) :])
+
+    def told(self, moved: float) -> None:
+        """By how many places the camera moved to the next query."""
+        self.moved = torch.tensor([moved], dtype=torch.float64)
 
     def _moved(self, count: int) -> Tensor:
         """How far the camera moved to each of the next queries, NaN where nothing tells it."""

@@ -9,6 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import Literal
 
+from torch import Tensor
 from typing_extensions import Self
 
 from dejavu_torch.data.turning import facing_north
@@ -115,7 +116,7 @@ class Querying(Sequences):
     top: int | None = None
     loops: int | None = None
     headings: int = 1
-    moved: Path | None = field(default=None, metadata=PYTHON)
+    moved: Path | Tensor | None = field(default=None, metadata=PYTHON)
     views: Views = field(default=ALONE, metadata=PYTHON)
 
     def order(self, matcher: SequenceModel | Literal["auto"] | None) -> bool | None:

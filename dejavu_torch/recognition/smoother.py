@@ -204,6 +204,7 @@ class PlaceSmoother(SequenceModel):
         motion, still = self.steps(scores.shape[1], route_starts, drive.means), drive.spacing.stopped
         if not isinstance(motion, AlongRoute):
             raise InputError(f"the motion is a {type(motion).__name__}; expected one along a route")
+        expect(self.moved is None, "`posterior`", "a path, and places moved")
         log = motion.wide(drive.log_likelihood(torch.arange(len(scores))), 0.0)
         best = [motion.anywhere().log() + log[0]] if len(scores) else []
         for t in range(1, len(scores)):
@@ -267,7 +268,11 @@ class PlaceSmoother(SequenceModel):
                 std, table = standardised(given, means), RankTable()
                 table.add(std.z, std.only(std.speaks[:, None].expand_as(std.z), False))
                 values = table.values
-        return Drive(rows, means, values, spacing, self.separation, self.tempering, presence, self.moved)
+        moved = self.moved
+        if moved is not None:
+            expect(self.motion is AlongRoute, "one of the two", "places moved, and a motion of one's own")
+            moved = odometry.checked_moved(moved, len(spacing.stopped))
+        return Drive(rows, means, values, spacing, self.separation, self.tempering, presence, moved)
 
     def blocks(
         self, drive: Drive, route_starts: Sequence[int] = (0,), size: int | None = None
@@ -461,9 +466,11 @@ def _by_odometry(
     def likelihood(steps: odometry.Steps, first: int, last: int) -> Tensor:
         numbers = steps.queries[first:last]
         known, log = numbers >= 0, drive.means.new_zeros(last - first, len(drive.means))
-        log[known] = drive.log_likelihood(numbers[known])
+        if known.any():
+            log[known] = drive.log_likelihood(numbers[known])
         return motion.wide(log.exp()[None], 1.0)
 
+    @torch.no_grad()
     def log_of(steps: odometry.Steps) -> float:
         still = steps.still[None].to(drive.means.device)
         numbers = range(0, still.shape[1], size_of(motion, still))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from fractions import Fraction
 from itertools import accumulate
@@ -16,7 +15,7 @@ from typing_extensions import Self
 from dejavu_torch.recognition import chosen
 from dejavu_torch.types import expect
 
-MOST_CHAINS = 24
+MOST_CHAINS, FASTEST = 24, 100
 
 
 class Speeds(NamedTuple):
@@ -113,10 +112,11 @@ def steady(
     cameras come at one place a query, and as many move freely.
 
     Raises:
-        InputError: speeds of 0 or less, not finite, or more than `MOST_CHAINS` in all.
+        InputError: speeds out of range, or more than `MOST_CHAINS` in all.
     """
     given = [float(speed) for speed in speeds]
-    expect(all(0 < speed < math.inf for speed in given), "numbers above 0", f"the speeds are {given}")
+    fits = all(1 / MOST_CHAINS <= speed <= FASTEST for speed in given)
+    expect(fits, f"{1 / MOST_CHAINS:.2g} to {FASTEST} places a query", f"the speeds are {given}")
     known = sorted({Fraction(speed).limit_denominator(MOST_CHAINS) for speed in speeds})
     chains = sum(map(_cycle, known))
     seen = f"the speeds {', '.join(map(str, known))} need {chains} chains of states"

@@ -24,6 +24,8 @@ from dejavu_torch import (
 )
 from dejavu_torch.live.localizer import as_batch
 from dejavu_torch.recognition.calibration import Calibration, Platt
+from dejavu_torch.recognition.querying import Querying
+from dejavu_torch.types import Match
 
 PLACES, SHAPE = 48, (3, 24, 32)
 
@@ -255,7 +257,9 @@ def test_a_stream_that_stalls_is_less_and_less_sure(spectral, drive, sequence):
     frames = drive[[min(t, 20) for t in range(50)]]
     found = [localizer(frame) for frame in frames]
     assert [match.stale for match in found] == [0] * 21 + [*range(1, 30)]
-    whole = spectral.localize(frames, sequence=sequence and PlaceFilter())
+    querying = Querying(match=sequence or "single", ordered=True)
+    whole = Match.joined(spectral.matches(frames, querying))
+    assert spectral.localize(frames, sequence=None).stale is None  # in no order
     assert whole.stale.tolist() == [match.stale for match in found]
     assert whole.index.tolist() == [match.place for match in found]
     assert whole.accepted.tolist() == [match.accepted for match in found]

@@ -1244,8 +1244,8 @@ MUTANTS = [
     Mutant(
         "A filter follows a camera that travels back.",
         "dejavu_torch/recognition/filter.py",
-        "directions = self.layout, like.shape[-1], 2 if self.back else 1",
-        "directions = self.layout, like.shape[-1], 1",
+        "layout, directions = self.layout, 2 if self.back else 1",
+        "layout, directions = self.layout, 1",
         ("tests/recognition/test_speeds.py", "tests/recognition/test_filter.py::-k literal"),
     ),
     Mutant(

@@ -18,9 +18,12 @@ from test_smoother import noise, shown
 from dejavu_torch import DejaVu, LiveLocalizer, PlaceFilter, PlaceSmoother, SequenceMatcher
 from dejavu_torch.places.layout import Layout
 from dejavu_torch.places.states import States
-from dejavu_torch.recognition import chosen, odometry
+from dejavu_torch.recognition import chosen, engine, odometry
+from dejavu_torch.recognition.drive import DriveQuery, localize_drives
 from dejavu_torch.recognition.engine import Rates
 from dejavu_torch.recognition.motion import AlongRoute
+from dejavu_torch.recognition.scorer import OfRows
+from dejavu_torch.recognition.smoother import rows_of
 from dejavu_torch.recognition.speeds import FREE, steady
 
 SLIP = chosen.ODOMETRY / 2
@@ -189,7 +192,7 @@ def test_a_csv_of_moves(model, route, tmp_path):
         ("x,y\n1,2\n", ["columns x, y", "a column moved"]),
         ("moved\n", ["0 rows", "a column moved"]),
         ("moved\n1\nfar\n", ["line 3", "'far'", "a number"]),
-        ("frame,moved\n1\n", ["line 2", "''", "a number"]),
+        ("frame,moved\n1,\n2\n", ["line 3", "''", "a number"]),
     ],
 )
 def test_a_csv_without_moves_is_refused(text, told, tmp_path):
@@ -199,21 +202,57 @@ def test_a_csv_without_moves_is_refused(text, told, tmp_path):
         odometry.read_moved(path)
 
 
+class Own(AlongRoute):
+    """A motion of one's own."""
+
+
+@torch.no_grad()
+def test_a_gap_and_moves_beyond_the_map():
+    """Of more places than a block has, and than there are."""
+    moved = torch.full((60,), 2.0)
+    moved[0], moved[30] = 1e6, 600  # the first does not count
+    path = [2 * t if t < 30 else 660 + 2 * (t - 30) for t in range(60)]
+    scores = shown(800, path, clear=3.0)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(engine, "NUMBERS_AT_ONCE", 2**12)
+        posterior = PlaceSmoother(moved=moved).posterior(scores, noise(60, 16))
+    assert float(((posterior[:, :-1].argmax(1) - torch.tensor(path)).abs() <= 2).double().mean()) > 0.9
+    found = PlaceSmoother(moved=moved).posterior(noise(60, 9), noise(60, 16))
+    assert found.isfinite().all()
+
+
+def test_drives_with_the_same_moves_are_matched_together():
+    scores, smoother = shown(80, [*range(60)]), PlaceSmoother(moved=torch.ones(60))
+    scorer = OfRows(rows_of(scores), noise(60, 16), Layout(80))
+    one, two = localize_drives([DriveQuery(scorer, smoother), DriveQuery(scorer, smoother)])
+    assert torch.equal(one.index, two.index)
+    assert float(((one.index[:, 0] - torch.arange(60)).abs() <= 2).double().mean()) > 0.9
+
+
 def test_what_cannot_be_moves_is_refused(model, route, tmp_path):
     queries, fits = route[:20], torch.ones(20)
     smoother = PlaceSmoother()
     with refused("moved is (19,) for 20 queries", "as many"):
         model.localize(queries, sequence=smoother, moved=fits[1:])
-    with refused("moved is -1 at query 3", "at least 0"):
+    with refused("moved is -1 at query 3", "0 to 1000"):
         model.localize(queries, sequence=smoother, moved=torch.where(torch.arange(20) == 3, -1.0, 1.0))
     with refused("moved is 475.9", "at most 100"):
         model.localize(queries, sequence=smoother, moved=501 * fits)
+    with refused("moved is nan at query 2"):
+        model.localize(queries, sequence=smoother, moved=fits.index_fill(0, torch.tensor(2), math.nan))
+    for wrong in (19, 21):
+        with refused(f"moved is ({wrong},) for 20 queries"):
+            model.localize(queries, sequence=PlaceSmoother(moved=torch.ones(wrong)))
+    with refused("a path, and places moved", "posterior"):
+        PlaceSmoother(moved=fits).path(noise(20, 30))
+    with refused("a motion of one's own"):
+        PlaceSmoother(moved=fits, motion=Own).posterior(noise(20, 30))
     for sequence in (None, SequenceMatcher(3)):
         with refused("places moved, and single images", "a drive or a filter"):
             model.localize(queries, sequence=sequence, moved=fits)
     with refused("moved 1 without a filter", "PlaceFilter"):
         LiveLocalizer(model, None)(route[0], moved=1.0)
-    with refused("moved is inf", "at least 0"):
+    with refused("moved is inf", "0 to 1000"):
         LiveLocalizer(model)(route[0], moved=math.inf)
 
 

@@ -87,8 +87,8 @@ def test_a_probability_of_each_place_goes_to_all_its_states_and_back():
 
 
 def test_speeds_that_are_none_are_refused():
-    for speeds in ([0], [-1.0], [float("nan")], [float("inf")]):
-        with refused("the speeds are", "above 0"):
+    for speeds in ([0], [-1.0], [0.001], [101], [float("nan")], [float("inf")]):
+        with refused("the speeds are", "0.042 to 100"):
             PlaceFilter(speeds=speeds)
     with refused("1/13, 1/11, 1/7", "31 chains", "at most 24"):
         steady([Fraction(1, 7), Fraction(1, 11), Fraction(1, 13)])
