@@ -26,7 +26,7 @@ LISTS = {"SLOW": chosen.MOVES, "FAST": chosen.MOVES}  # in place of these: no ot
 HALVED = (
     *("SMALLEST", "SHARPENED", "UNCHANGED", "STOP", "RADIUS", "TAIL", "MOST_ABSENT", "MOST_PRESENT"),
     *("MIN_SEPARATION", "ROUNDS", "MOVE_SHARE", "RATE_COUNTS", "ENTER_COUNTS", "OTHER_SPEED", "PER_QUERY"),
-    *("CLEARLY", "FITTED", "STRETCH", "CORRELATED", "DOUBT"),
+    *("CLEARLY", "FITTED", "STRETCH", "CORRELATED", "DOUBT", "SLIP", "CHANGE_COUNTS", "ASKED", "SELDOM"),
 )
 COLUMNS: dict[str, Column] = {
     **{"AUC": ("auc", ".4f"), "most lost": ("lost", ".3f"), "most gained": ("gained", ".3f")},
