@@ -220,7 +220,7 @@ class PlaceSmoother(SequenceModel):
                 reached = reached + motion.expected(target).log()
             states.append(int(reached.argmax()))
         state, n = torch.tensor(states[::-1], dtype=torch.int64), scores.shape[1]
-        off, place = motion.anywhere().shape[-1] - 1, state % (2 * n)
+        off, place = motion.anywhere().shape[-1] - 1, state % (motion.states.directions * n)
         return torch.where(state < off, torch.where(place < n, place, 2 * n - 1 - place), -1)
 
     def steps(self, places: int, route_starts: Sequence[int], like: Tensor) -> Motion:
