@@ -1253,13 +1253,13 @@ MUTANTS = [
         "dejavu_torch/recognition/odometry.py",
         "at = places.clamp(min=1).cumsum(0) - 1",
         "at = places.clamp(min=1).cumsum(0) - places.clamp(min=1)",
-        ("tests/recognition/test_odometry.py",),
+        ("tests/recognition/test_moved.py",),
     ),
     Mutant(
         "A whole drive finds the scale of its odometry.",
         "dejavu_torch/recognition/smoother.py",
         "for scale in chosen.SCALES), key=log_of)",
         "for scale in (1.0,)), key=log_of)",
-        ("tests/recognition/test_odometry.py::-k scale",),
+        ("tests/recognition/test_moved.py::-k scale",),
     ),
 ]
