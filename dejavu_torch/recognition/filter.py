@@ -83,8 +83,8 @@ class PlaceFilter(SequenceModel):
     """The place of the latest query given all queries: the forward algorithm of a hidden Markov model.
 
     Its states are the N places, in both directions of travel and at several speeds, and one off-map state. A
-    place scored z standard deviations below the mean of
-    a query's scores has the likelihood exp(sharpness z), the off-map state exp(sharpness off_map).
+    place scored z standard deviations below the mean of a query's scores has the likelihood exp(sharpness z),
+    the off-map state exp(sharpness off_map).
 
     Args:
         moves: probabilities of moving by 0, 1, .., V places from one query to the next, where no steady speed
@@ -111,8 +111,9 @@ class PlaceFilter(SequenceModel):
         L-th before the latest that it has not given yet.
 
     Convention: causal. exp(-score) is at most the probability that the right place is within `within` places.
-        A place that nothing covers is passed as one off the map, and scores +inf. `moves` to `off_map` are
-        parameters. The state of `step` is a `FilterState`; an exported graph has one tensor, see `packed`.
+        A place that nothing covers is passed as one off the map, and scores +inf. `moves` to `off_map`,
+        but for `turn`, `back` and `speeds`, are parameters. The state of `step` is a `FilterState`; an
+        exported graph has one tensor, see `packed`.
         With a lag of all queries but one, the answers are those of forward-backward smoothing.
 
     Source: the topometric filter of Xu, Fischer, Sünderhauf and Milford (RA-L 2021) has an off-map state; the
@@ -235,7 +236,7 @@ class PlaceFilter(SequenceModel):
             motion = self.motion(scores, (0,), state.learned)
             belief = motion.unfolded(before.to(scores))
             state = state._replace(belief=belief, posterior=before)
-        return self._answers(scores, state, last=True)[0]
+        return self.followed(scores, state)[0]
 
     def followed(self, scores: Tensor, state: FilterState | None = None) -> tuple[Tensor, FilterState]:
         """As `posterior`, from the state after the queries before, and the next state."""
