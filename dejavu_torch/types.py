@@ -352,6 +352,18 @@ class Training(NamedTuple):
     seed: int | None
 
 
+class Doubt(NamedTuple):
+    """Why answers, a truth or coordinates may mislead: what was seen, and the option that would mend it, if
+    one does. An entry of `doubts` in report.json."""
+
+    kind: str
+    text: str
+    option: str = ""
+
+    def __str__(self) -> str:
+        return f"{self.text}: {self.option}" if self.option else self.text
+
+
 class SequenceModel(nn.Module, ABC):
     """Combines the scores of consecutive queries: the `sequence` argument of `DejaVu.localize`.
 

@@ -21,6 +21,7 @@ from dejavu_torch.cli.device import device_of
 from dejavu_torch.data.output import check_output_file, check_output_folder, whole_folder
 from dejavu_torch.data.source import check_not_read, open_source
 from dejavu_torch.evaluation.answers import describe_line
+from dejavu_torch.evaluation.doubts import doubt_lines
 from dejavu_torch.evaluation.options import UNREAD, Reporting, several
 from dejavu_torch.model import DejaVu
 from dejavu_torch.model_file import recipe_of
@@ -349,9 +350,11 @@ def _print_run(run: Localization) -> None:
 
 
 def _print_contradiction(report: Report) -> None:
-    """Say first if the answers contradict the ground truth."""
+    """Say first if the answers contradict the ground truth, and what else is doubtful."""
     if report.ours.scores is not None and (line := describe_line(report.facts, True)):
         say(line)
+    for doubt in doubt_lines(report.facts):
+        say(doubt)
 
 
 def _print_scores(report: Report, out: Path) -> None:

@@ -30,6 +30,7 @@ from dejavu_torch.data.traverse import fitted, kept
 from dejavu_torch.data.turning import facing_north, is_turned
 from dejavu_torch.evaluation.baselines import Baseline, baselines_of, matched
 from dejavu_torch.evaluation.contenders import COLOURS, Contender, contend, models_beside
+from dejavu_torch.evaluation.doubts import doubt_facts, doubts_of
 from dejavu_torch.evaluation.evaluate import RANKS
 from dejavu_torch.evaluation.facts import facts_of, match_facts, metric_facts, peak_memory, view_facts
 from dejavu_torch.evaluation.localization import NOTHING, Localization
@@ -386,6 +387,7 @@ def _told(plan: Plan, run: Localization, ranked: Match, off_map: dict[str, Tenso
         **({"headings": headings} if headings > 1 else {}),
         **view_facts(run),
         **metric_facts(run, truth),
+        **doubt_facts(doubts_of(run)),
         **({"second": views.placed_facts()} if views is not None and views.placed else {}),
     }
     pictures = draw_pictures(run, {"map": ours}) | draw_reliability(run.scored, run.truth, run.tolerance)

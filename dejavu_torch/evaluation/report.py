@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 from dejavu_torch.data.output import whole_folder
 from dejavu_torch.evaluation.answers import describe_line, describe_probable, next_steps
 from dejavu_torch.evaluation.contenders import Contender, colour_of, distinct, sequences_as_json
+from dejavu_torch.evaluation.doubts import doubt_lines
 from dejavu_torch.evaluation.plots import Picture, Pictures
 from dejavu_torch.evaluation.prose import sentences, templates
 from dejavu_torch.evaluation.rejection import rejection_table
@@ -74,7 +75,8 @@ class Report(NamedTuple):
         others = f"; compared with {', '.join(self.contenders)}" if self.contenders else ""
         first = summary(self).partition(". ")[0].rstrip(".")
         line = describe_line(self.facts, bool(scores))
-        return "\n".join(filter(None, [first, f"{scores}{others}", line, "all of report.json: as_json()"]))
+        lines = [first, f"{scores}{others}", line, *doubt_lines(self.facts), "all of report.json: as_json()"]
+        return "\n".join(filter(None, lines))
 
 
 def score_table(report: Report, every: bool = False) -> list[list[str]]:
@@ -288,6 +290,7 @@ def write_report(
         folder,
         title=printable(title),
         verdict=verdict(report),
+        doubts=doubt_lines(facts),
         summary=summary(report),
         steps=steps(report),
         first=embedded.pop(first, None),
