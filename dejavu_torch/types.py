@@ -70,6 +70,7 @@ class Traverse(Dataset[Tensor], ABC):
         sized: whether the user asked for their size, as with `width=` of a video.
         deep: whether its images have more than 8 bits a pixel.
         layout: where its frames lie, if they become the places of a map: along a route, or over an area.
+        beyond: frames that `stop=` left out after the last.
         cut: of windows of one long image, its size, the window's, and their range; equal: the same places.
 
     Raises:
@@ -90,6 +91,7 @@ class Traverse(Dataset[Tensor], ABC):
     headings: Tensor | None = None
     ordered: bool = False
     sized: bool = False
+    beyond: int = 0
     cut: tuple[tuple[int, ...], range] | None = None
     _layout: Layout = ROUTE
 
@@ -195,11 +197,17 @@ def as_range(numbers: list[int]) -> range | list[int]:
 class Coordinates(NamedTuple):
     """Where frames were taken: (N,2) or (N,3) float64 in metres, or latitude and longitude in degrees (N,2);
     NaN where that is unknown. frame: what they count from, such as "EPSG:32632" of a map, or "pixels" of a
-    picture; only those of one frame are compared. "" is any."""
+    picture; only those of one frame are compared. "" is any. height: the column that is the height, of 3."""
 
     values: Tensor
     degrees: bool = False
     frame: str = ""
+    height: int = 2
+
+    def flat(self) -> Coordinates:
+        """Without heights."""
+        ground = [column for column in range(3) if column != self.height]
+        return self if self.values.shape[1] < 3 else self._replace(values=self.values[:, ground], height=2)
 
 
 @dataclass(frozen=True)

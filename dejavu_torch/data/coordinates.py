@@ -5,9 +5,9 @@ from __future__ import annotations
 import logging
 import math
 import re
+from collections import Counter
 from collections.abc import Sequence
 from functools import cache
-from itertools import pairwise
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -15,8 +15,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dejavu_torch.data.files import as_number, read_rows
+from dejavu_torch.data.files import as_number
+from dejavu_torch.data.fixes import checked_fixes
+from dejavu_torch.data.folder import natural
 from dejavu_torch.data.geotiff import from_degrees
+from dejavu_torch.data.tables import Table, number, read_table, whole
 from dejavu_torch.types import Coordinates, InputError, Traverse, expect
 
 log = logging.getLogger("dejavu_torch")
@@ -30,10 +33,11 @@ EXPECTED = (
     "a csv with the columns x,y or lat,lon, and name or time where rows are not frames; poses of KITTI, "
     "12 numbers a line; or of TUM or EuRoC, with times"
 )
-PAIRS = ("x", "y"), ("lat", "lon"), ("latitude", "longitude"), ("easting", "northing")  # columns
-TIMES = "time", "timestamp"
+PAIRS = ("x", "y"), ("lat", "lon"), ("easting", "northing")  # columns
 UNITS = (1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3)  # times above are in nano-, micro- or milliseconds
 OF_MAPS = re.compile(r"EPSG:|.*\[")  # coordinate systems, by number or as text; not pixels
+COUNTED = 1e8  # whole numbers in names below count frames; times in seconds are larger
+COVERED = 0.5  # of such numbers within the times of a table, to be times
 GAP = 1.0  # seconds between two rows within which no frame has coordinates
 
 
@@ -84,51 +88,56 @@ def coordinates_of(traverses: Sequence[Traverse], kind: Kind) -> list[Tensor]:
     frames = {own.frame: one.name for own, one in zip(known, traverses, strict=True) if own.frame}
     seen = " and ".join(f"coordinates of {name} in {frame}" for frame, name in frames.items())
     expect(len(frames) < 2, "one system for both, as by gdalwarp -t_srs", seen)
-    shared = min(own.values.shape[1] for own in known)
-    return [own.values[:, :shared] for own in known]
+    if len({own.values.shape[1] for own in known}) > 1:
+        flat = traverses[[own.values.shape[1] for own in known].index(2)].name
+        _warn_flat(flat)
+        known = [own.flat() for own in known]
+    return [own.values for own in known]
 
 
 def read_coordinates(path: Path, traverse: Traverse) -> tuple[Coordinates, Tensor | None]:
-    """Where the frames of a traverse were taken, from a file of one row a frame, or with names or times; and
-    their headings (N,) in degrees, if there are any.
+    """Where the frames of a traverse were taken, from a file of one row a frame, or with names, times or
+    numbers of frames; and their headings (N,) in degrees, if there are any. What is no place is told and
+    left out, see `checked_fixes`.
 
     Args:
-        path: a csv whose header has x,y[,z], easting,northing or lat,lon, and may have `name`, of images, or
-            `time`; poses of KITTI (12 numbers: the 4th, 8th and 12th), TUM (`time x y z`, a quaternion), or
-            EuRoC (the same between commas, in nanoseconds). Times are compared with those of a video, or with
-            image names that are times; both in seconds, or in the unit that their size tells. Between rows up
-            to a second apart they are interpolated. A column `heading` has degrees clockwise from north, or
-            from the upper side of a picture.
+        path: a table whose header has x,y[,z], easting,northing or lat,lon, and may have `name`, of images,
+            `time`, or `frame`, from 0, also by other names and with units, see `read_table`. Poses of KITTI
+            (12 numbers: the 4th, 8th and 12th), TUM (`time x y z`, a quaternion), or EuRoC (the same between
+            commas, in nanoseconds). Times are compared with those of a video, or with image names that are
+            times; both in seconds, or in the unit that their size tells. Between rows up to a second apart
+            coordinates are interpolated. A column `heading` has degrees clockwise from
+            north, or from the upper side of a picture.
 
     Raises:
         InputError: another file, or rows that fit no frames.
     """
-    rows = [
-        (line, re.split(r"[\s,]+", cells[0]) if len(cells) == 1 else cells)
-        for line, cells in read_rows(path, EXPECTED)
-        if not cells[0].startswith("#")
-    ]
-    expect(rows, EXPECTED, f"{path} has no rows")
-    key, degrees, turns, columns = _columns(path, rows)
-    for line, cells in rows:
-        seen = f"{path}, line {line}: {len(cells)} columns"
-        expect(len(cells) > max(columns), f"{max(columns) + 1} or more", seen)
-    values = np.array([[_value(cells[column]) for column in columns] for _, cells in rows])
+    table = read_table(path, EXPECTED)
+    expect(table.rows or table.header, EXPECTED, f"{path} has no rows")
+    columns, degrees, height = _columns(table)
+    turns = "heading" in table
+    columns += [table.at("heading")] if turns else []
+    table.check_width(max(columns) + 1)
+    values, dimensions = np.stack([table.numbers(column) for column in columns], 1), len(columns) - turns
     if turns:
         known = ~np.isnan(values[:, -1])  # from one to the next the shorter way around
         values[known, -1] = np.unwrap(values[known, -1], period=360)
     if degrees and not (np.abs(np.nan_to_num(values[:, :2])) <= (90, 180)).all():
         raise InputError(f"{path} has latitudes beyond 90 or longitudes beyond 180; expected degrees")
-    if key is None:
-        seen = f"{path} has {len(values)} rows, {traverse.name} {len(traverse)} frames"
-        expect(len(values) == len(traverse), "as many, or a column name or time", seen)
-    elif key[1] == "name":
-        known = dict(zip((cells[key[0]] for _, cells in rows), values, strict=True))
-        values = np.array([known.get(name, np.full(len(columns), math.nan)) for name in traverse.names])
-    else:
-        values = _at_times(path, np.array([_value(cells[key[0]]) for _, cells in rows]), values, traverse)
+    order = _in_order(table)
+    lines = [table.rows[row][0] for row in order]
+    values[order, :dimensions], seen = checked_fixes(values[order, :dimensions], degrees, lines)
+    values = _of_frames(table, values, traverse)
+    if unused := table.unused():
+        seen.append(
+            f"the columns {', '.join(unused)} are not used"
+            if unused[1:]
+            else f"the column {unused[0]} is not used"
+        )
+    for line in seen:
+        log.warning("%s: %s", path, line)
     headings = torch.from_numpy(values[:, -1].copy() % 360) if turns else None
-    values = values[:, : values.shape[1] - turns]
+    values = values[:, :dimensions]
     missing = int(np.isnan(values).any(1).sum()) if len(values) else len(traverse)
     expect(missing != len(traverse), "its names or times", f"{path} tells of no frame of {traverse.name}")
     if missing:
@@ -136,40 +145,86 @@ def read_coordinates(path: Path, traverse: Traverse) -> tuple[Coordinates, Tenso
     if headings is not None and (unknown := int(headings.isnan().sum())):
         log.warning("%s: %d of %d frames have no heading", traverse.name, unknown, len(traverse))
         headings = None if unknown == len(headings) else headings
-    return Coordinates(torch.from_numpy(values), degrees), headings
+    return Coordinates(torch.from_numpy(values), degrees, height=height), headings
 
 
-def _columns(
-    path: Path, rows: list[tuple[int, list[str]]]
-) -> tuple[tuple[int, str] | None, bool, bool, tuple[int, ...]]:
-    """The column of names or times, whether coordinates are degrees, whether headings follow them, and their
-    columns; a header is removed from the rows."""
-    first = rows[0][1]
-    if not any(math.isnan(_value(cell)) for cell in first):
-        if len(first) == 12:  # KITTI
-            return None, False, False, (3, 7, 11)
-        if len(first) in (8, 17):  # TUM, EuRoC
-            return (0, "time"), False, False, (1, 2, 3)
-        raise InputError(f"{path} has {len(first)} columns without a header; expected {EXPECTED}")
-    header = [cell.strip().lower() for cell in rows.pop(0)[1]]
-    pair = next((pair for pair in PAIRS if {*pair} <= {*header}), None)
-    if pair is None or not rows:
-        raise InputError(f"{path} has the columns {', '.join(header)}; expected {EXPECTED}")
-    degrees = pair[0].startswith("lat")
-    names = (*pair, "z") if not degrees and "z" in header else pair
-    key = next(((header.index(one), one) for one in ("name", *TIMES) if one in header), None)
-    turns = "heading" in header
-    names = (*names, "heading") if turns else names
-    return key, degrees, turns, tuple(header.index(name) for name in names)
+def _columns(table: Table) -> tuple[list[int], bool, int]:
+    """The columns of coordinates, whether they are degrees, and which of them is the height."""
+    if not table.header:
+        width = len(table.rows[0][1])
+        if width == 12:  # KITTI: to the right, down, ahead
+            return [3, 7, 11], False, 1
+        if width in (8, 17):  # TUM, EuRoC
+            table.named("time", *"xyz")
+            return [1, 2, 3], False, 2
+        raise InputError(f"{table}; expected {EXPECTED}")
+    pair = next((pair for pair in PAIRS if all(one in table for one in pair)), None)
+    if pair is None or not table.rows:
+        raise InputError(f"{table}; expected {EXPECTED}")
+    degrees = pair[0] == "lat"
+    names = (*pair, "z") if not degrees and "z" in table else pair
+    if degrees and "z" in table:
+        table.at("z")  # heights of receivers are no better than tens of metres
+    return [table.at(name) for name in names], degrees, 2
 
 
-def _value(text: str) -> float:
-    """A number of any size; NaN for anything else."""
-    try:
-        value = float(text)
-    except ValueError:
-        return math.nan
-    return value if math.isfinite(value) else math.nan
+def _in_order(table: Table) -> list[int]:
+    """The rows in the order in which they were taken, as far as it is known."""
+    if "time" in table or "frame" in table:
+        order = np.argsort(table.numbers("time" if "time" in table else "frame"), kind="stable")
+        return [int(row) for row in order]
+    names = table.text("name") if "name" in table else []
+    return sorted(range(len(table)), key=lambda row: natural(names[row])) if names else [*range(len(table))]
+
+
+def _of_frames(table: Table, values: np.ndarray, traverse: Traverse) -> np.ndarray:
+    """The rows (R,K) of the frames of a traverse, (N,K), NaN where there is none."""
+    path, frames = table.path, len(traverse)
+    none = np.full(values.shape[1], math.nan)
+    if "name" in table:
+        rows: dict[str, int] = {}
+        for row, name in enumerate(table.text("name")):
+            seen = f"{table.where(row)}: {name} is there twice"
+            fits = name not in rows or np.array_equal(values[rows[name]], values[row], equal_nan=True)
+            expect(fits, f"the row of line {table.rows[rows.get(name, row)][0]} alone", seen)
+            rows.setdefault(name, row)
+        for way in (str, _last, _stem):  # names of a file may have folders, or no suffix
+            by = {way(name): row for name, row in rows.items()}
+            if len(by) == len(rows) and any(way(name) in by for name in traverse.names):
+                found = (by.get(way(name)) for name in traverse.names)
+                return np.array([none if row is None else values[row] for row in found])
+        seen = f"{path} tells of no frame of {traverse.name}"
+        raise InputError(f"{seen}; expected its names or times, such as {[*traverse.names, 'none'][0]}")
+    taken = _times(table, traverse) if "time" in table else None
+    if "time" in table and (taken is not None or len(values) != frames):
+        times = table.numbers("time")
+        if "nsec" in table:
+            times = times + 1e-9 * table.numbers("nsec")
+        return _at_times(table, times, values, traverse.name, taken)
+    if "frame" in table and not ("time" in table and len(values) == frames):
+        numbers = [whole(cell, "frame", 0, table.where(row)) for row, cell in enumerate(table.text("frame"))]
+        beyond = [number for number in numbers if number >= frames]
+        from_one = (
+            "; do they count from 1?" if beyond and min(numbers) == 1 and max(numbers) == frames else ""
+        )
+        seen = f"{path} has {len(beyond)} frames beyond the last, such as {min(beyond, default=0)}{from_one}"
+        expect(not beyond, f"frames from 0 to {frames - 1} of {traverse.name}", seen)
+        twice = next((number for number, count in Counter(numbers).items() if count > 1), None)
+        expect(twice is None, "each once", f"{path} has frame {twice} twice")
+        every = np.full((frames, values.shape[1]), math.nan)
+        every[numbers] = values
+        return every
+    seen = f"{path} has {len(values)} rows, {traverse.name} {frames} frames"
+    expect(len(values) == frames, "as many, or a column name or time or frame", seen)
+    return values
+
+
+def _last(name: str) -> str:
+    return re.split(r"[/\\]", name)[-1]
+
+
+def _stem(name: str) -> str:
+    return Path(_last(name)).stem
 
 
 def _seconds(times: np.ndarray) -> np.ndarray:
@@ -178,22 +233,51 @@ def _seconds(times: np.ndarray) -> np.ndarray:
     return times * next((factor for least, factor in UNITS if largest > least), 1.0)
 
 
-def _at_times(path: Path, times: np.ndarray, values: np.ndarray, traverse: Traverse) -> np.ndarray:
-    """The values (M,K) at times (M,), at the times of the frames: (N,K), NaN in gaps."""
+def _times(table: Table, traverse: Traverse) -> np.ndarray | None:
+    """When frames were taken (N,), as they or their names tell; numbers in names that merely count are times
+    only if the table's are about as large."""
     if traverse.times is not None:
-        asked = traverse.times.numpy()
-    else:
-        asked = np.array([_value(Path(name).stem) for name in traverse.names])
-    if not len(asked) or np.isnan(asked).all() or np.isnan(times).any():
-        why = f"{path} has a row without a time" if np.isnan(times).any() else f"{traverse.name} has no times"
+        asked: np.ndarray = traverse.times.numpy()
+        return asked
+    named, times = np.array([number(_stem(name)) for name in traverse.names]), table.numbers("time")
+    known = named[~np.isnan(named)]
+    if not len(known) or known.max() >= COUNTED or (known % 1).any():
+        return named if len(known) else None
+    within = (known >= np.nanmin(times)) & (known <= np.nanmax(times))
+    return named if np.isnan(times).all() or within.mean() >= COVERED else None
+
+
+def _range(times: np.ndarray) -> str:
+    return f"{np.nanmin(times):.14g} to {np.nanmax(times):.14g} s"
+
+
+def _at_times(
+    table: Table, times: np.ndarray, values: np.ndarray, name: str, asked: np.ndarray | None
+) -> np.ndarray:
+    """The values (M,K) at times (M,), at the times of the frames: (N,K), NaN in gaps."""
+    path = table.path
+    if asked is None or np.isnan(times).any():
+        why = f"{path} has a row without a time"
+        why = why if np.isnan(times).any() else f"{name} has no times within those of {path}, {_range(times)}"
         raise InputError(f"{why}; expected a video, image names such as 1305031102.975.png, or a row a frame")
     asked, times = _seconds(asked), _seconds(times)
-    if any(a >= b for a, b in pairwise(times.tolist())):
-        raise InputError(f"{path} has times that do not rise; expected rows in order")
+    kept = np.append(True, (np.diff(times) != 0) | (np.diff(values, axis=0) != 0).any(1))
+    times, values = times[kept], values[kept]
+    equal, falls = np.flatnonzero(np.diff(times) == 0), (np.diff(times) < 0).any()
+    if falls or len(equal):
+        lines = np.array([line for line, _ in table.rows])[kept]
+        seen = f"{path} has times that do not rise; expected rows in order"
+        if not falls:
+            first = f"lines {lines[equal[0]]} and {lines[equal[0] + 1]} both have {times[equal[0]]:.17g} s"
+            seen = f"{path} has {len(equal)} times twice: {first}; expected times with more digits"
+        raise InputError(seen)
     at = np.column_stack([np.interp(asked, times, column, math.nan, math.nan) for column in values.T])
     after = np.searchsorted(times, asked).clip(1, max(1, len(times) - 1))
     gap = times[after % len(times)] - times[after - 1] if len(times) > 1 else np.zeros(len(asked))
     exact = np.isin(asked, times)
+    seen = f"{path} has the times {_range(times)}, {name} {_range(asked)}"
+    within = (asked >= times[0]) & (asked <= times[-1])
+    expect(within.any(), "times of one clock", seen)
     return np.where(((gap <= GAP) | exact)[:, None], at, math.nan)
 
 
@@ -270,6 +354,11 @@ def _fixes(traverse: Traverse, kind: Kind) -> list[Fix]:
 def _warn_missing(source: str, missing: int, frames: int, example: str) -> None:
     line = "%s: %d of %d frames have no coordinates, such as %s, and are not scored"
     log.warning(line, source, missing, frames, example)
+
+
+@cache
+def _warn_flat(name: str) -> None:
+    log.warning("%s has coordinates of two numbers: the heights of the other visit are not compared", name)
 
 
 def _fix(name: str) -> Fix:

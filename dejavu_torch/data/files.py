@@ -67,10 +67,12 @@ def read_rows(path: Path, expected: str) -> list[tuple[int, list[str]]]:
     """Line number and cells of each line of a csv that is not blank.
 
     The separator is the first of semicolon, tab, comma and space that occurs in the first line with several
-    cells. Between semicolons, a comma stays in its cell: it may be a decimal comma.
+    cells that is no comment, after "#". Between semicolons, a comma stays in its cell: it may be a decimal
+    comma.
     """
     lines = read_text(path, expected).splitlines()
-    separator = next((sign for line in lines for sign in ";\t," if sign in line), " ")
+    cells = (line for line in lines if line[:1] != "#")
+    separator = next((sign for line in cells for sign in ";\t," if sign in line), " ")
     reader = csv.reader(lines, delimiter=separator, skipinitialspace=True)
     try:
         rows = [(reader.line_num, [cell.strip() for cell in row]) for row in reader]

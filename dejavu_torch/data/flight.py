@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.functional import grid_sample, normalize
 
-from dejavu_torch.data.files import as_number, read_rows
 from dejavu_torch.data.grid import BYTES, PIXELS
 from dejavu_torch.data.picture import Pixels, read_picture
+from dejavu_torch.data.tables import read_table
 from dejavu_torch.places.rectangles import Ground
 from dejavu_torch.text import printable
 from dejavu_torch.types import Coordinates, InputError, Traverse, expect
@@ -102,18 +103,12 @@ def read_flight(path: Path, points: str = "", window: int = 64, scale: float = 1
     """
     name = printable(path)
     expect(points, "points=FILE", f"{name}: points is missing")
-    rows = read_rows(Path(points), EXPECTED)
-    header = [cell.lower() for cell in rows[0][1]] if rows else []
-    seen = f"{points} has " + (f"the columns {', '.join(header)}" if rows else "no rows")
-    expect({"x", "y"} <= {*header} and len(rows) > 1, EXPECTED, seen)
-    columns = [header.index(one) for one in ("x", "y", "heading") if one in header]
-    lines = [f"{points}, line {line}" for line, _ in rows[1:]]
-    values = torch.empty(len(lines), len(columns), dtype=torch.float64)
-    for i, (_, cells) in enumerate(rows[1:]):
-        numbers = [as_number(cells[column]) if column < len(cells) else None for column in columns]
-        known = [number for number in numbers if number is not None]
-        expect(len(known) == len(columns), "numbers", f"{lines[i]}: {', '.join(cells)}")
-        values[i] = torch.tensor(known, dtype=torch.float64)
+    table = read_table(Path(points), EXPECTED)
+    expect("x" in table and "y" in table and table.rows, EXPECTED, str(table))
+    columns = [table.numbers(one) for one in ("x", "y", "heading") if one in table]
+    values, lines = torch.from_numpy(np.stack(columns, 1)), [table.where(row) for row in range(len(table))]
+    for row in values.isnan().any(1).nonzero()[:1, 0].tolist():
+        raise InputError(f"{lines[row]}: {', '.join(table.rows[row][1])}; expected numbers")
     picture, _, ground = read_picture(path, scale)
     told = f"{name}?points={points}&window={window}" + (f"&scale={scale:g}" if scale < 1 else "")
     headings = values[:, 2] if len(columns) == 3 else None

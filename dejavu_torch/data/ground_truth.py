@@ -22,7 +22,7 @@ from torch.nn.utils.rnn import pad_sequence
 from dejavu_torch.data.coordinates import FORMS as COORDINATES
 from dejavu_torch.data.coordinates import OF_MAPS, Near, coordinates_of
 from dejavu_torch.data.files import LARGEST, as_number, check_regular
-from dejavu_torch.data.truth_files import places_of_queries, read_csv, read_json, read_matrices
+from dejavu_torch.data.truth_files import places_of_queries, read_csv, read_json, read_matrices, until
 from dejavu_torch.memory import check_room
 from dejavu_torch.places.layout import Layout
 from dejavu_torch.text import one_line, rounded
@@ -358,9 +358,11 @@ def find_ground_truth(
             ignored = padded(row.nonzero()[:, 0] for row in soft[0] & ~hard)
             ground_truth = ground_truth._replace(ignored=ignored)
     else:
-        length = len(query) if query is not None and resampled else None
+        length = len(query) if query is not None else None
         if parsed.suffix.lower() == ".csv":
-            listed = read_csv(parsed, frames, interpolate)
+            more = 0 if reference is None else reference.beyond
+            listed = read_csv(parsed, None if frames is None else frames + more, interpolate)
+            listed = until(listed, query, reference, parsed)
         else:
             count = len(numbers) if all_frames else length
             listed = read_json(parsed, frames, count, int(numbers.max()) + 1)

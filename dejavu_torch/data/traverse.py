@@ -38,6 +38,8 @@ class Part(Traverse):
     def __init__(self, traverse: Traverse, frame: Tensor | range) -> None:
         self.traverse, self.frame, self.name = traverse, frame, traverse.name
         self.sized, self.ordered = traverse.sized, traverse.ordered
+        if isinstance(frame, range):
+            self.beyond = (len(traverse) + traverse.beyond - frame.stop) // frame.step
         self.times, self.places, self.headings = (
             None if values is None else values[torch.as_tensor(frame)]
             for values in (traverse.times, traverse.places, traverse.headings)

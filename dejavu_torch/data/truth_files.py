@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import math
 import re
 import zipfile
@@ -13,9 +14,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dejavu_torch.data.files import LARGEST, as_number, read_rows, read_text, reading
+from dejavu_torch.data.files import LARGEST, as_number, read_text, reading
+from dejavu_torch.data.tables import read_table
 from dejavu_torch.memory import check_room
-from dejavu_torch.types import InputError, expect
+from dejavu_torch.types import InputError, Traverse, expect
+
+log = logging.getLogger("dejavu_torch")
 
 Listed = dict[int, list[float]]  # the places of each query in a file
 
@@ -27,16 +31,20 @@ def places_of_queries(
 
     Args:
         listed: the content of the file. numbers: (Q,) the frame of each query in its source.
-        length: of the query's source, if it is resampled.
+        length: of the query's source, if it is known.
     """
     first, last = min(listed), max(listed)
+    if length is not None and last >= length:
+        beyond, what = sorted(query for query in listed if query >= length), "queries beyond the last frame:"
+        what = f"{len(beyond)} {what} {beyond[0]} to" if beyond[1:] else "query"
+        from_one = "; do they count from 1?" if first == 1 and last == length else ""
+        seen = f"{path} lists {what} {last}{from_one}"
+        raise InputError(f"{seen}; expected frames from 0 to {length - 1}")
     queries = numbers.tolist()
     if interpolate:
         knots = sorted(listed)
         between = np.interp(numbers.numpy(), knots, [listed[query][0] for query in knots]).tolist()
         listed = {query: [at] for query, at in zip(queries, between, strict=True) if first <= query <= last}
-    elif length is not None and last >= length:
-        raise InputError(f"{path} lists query {last}; expected frames from 0 to {length - 1}")
     elif resampled:
         listed = _to_queries(listed, numbers)
     judged = torch.tensor([query in listed for query in queries])
@@ -59,18 +67,28 @@ def _to_queries(listed: Listed, frames: Tensor) -> Listed:
     return moved
 
 
+def until(listed: Listed, query: Traverse | None, reference: Traverse | None, name: object) -> Listed:
+    """Without queries and places that a `stop=` of their sources left out, which are counted in one line."""
+    ends = [LARGEST if source is None or not source.beyond else len(source) for source in (query, reference)]
+    kept = {
+        query: [one for one in places if one < ends[1]] for query, places in listed.items() if query < ends[0]
+    }
+    left = sum(map(len, listed.values())) - sum(map(len, kept.values()))
+    if kept and left:
+        log.warning("%s: %d of its right places lie beyond a stop, of queries or of places", name, left)
+    return kept or listed
+
+
 def read_csv(path: Path, frames: int | None, interpolate: bool) -> Listed:
     """The places of lines of query,place[,place...]."""
-    rows = read_rows(path, "lines of query,place")
-    if rows and all(as_number(cell) is None for cell in rows[0][1] if cell):
-        number, names = rows.pop(0)
-        # any other column, such as a distance, would be read as a right place
-        if names[0].lower() != "query" or not all(re.match("place|$", name.lower()) for name in names[1:]):
-            expected = "query,place[,place...]"
-            raise InputError(f"{path}, line {number}: columns {','.join(names)}; expected {expected}")
+    table = read_table(path, "lines of query,place")
+    names = [column.title for column in table.header]
+    # any other column, such as a distance, would be read as a right place
+    fits = not names or (names[0] == "query" and all(re.match("place|$", name) for name in names[1:]))
+    expect(fits, "query,place[,place...]", f"{path}, line {table.line}: columns {','.join(names)}")
     end, valid = (LARGEST, "0") if frames is None else (frames, f"0 to {frames - 1}")
     listed: Listed = {}
-    for line, cells in rows:
+    for line, cells in table.rows:
         while not cells[-1]:
             del cells[-1]
         numbers = [value for value in map(as_number, cells) if value is not None]

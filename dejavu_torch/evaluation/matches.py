@@ -6,7 +6,7 @@ import csv
 import itertools
 import logging
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
@@ -15,12 +15,13 @@ from typing import NamedTuple, TextIO
 import torch
 from torch import Tensor
 
-from dejavu_torch.data.files import as_number, read_rows
+from dejavu_torch.data.files import as_number
 from dejavu_torch.data.output import whole_file
+from dejavu_torch.data.tables import read_table, whole
 from dejavu_torch.places.frame_table import FrameTable
 from dejavu_torch.places.layout import ROUTE
 from dejavu_torch.text import printable
-from dejavu_torch.types import InputError, Match
+from dejavu_torch.types import InputError, Match, expect
 
 log = logging.getLogger("dejavu_torch")
 
@@ -179,7 +180,15 @@ def read_matches(
     ranked: list[list[int]] = []
     seen: set[int] = set()
     named: dict[str, None] = {}
-    for where, cells in _rows(path):
+    table = read_table(path, EXPECTED)
+    titles = [column.title for column in table.header]
+    missing = next((name for name in ("query", "place", "score") if name not in titles), None)
+    expect(
+        missing is None or not (titles or len(table)),
+        EXPECTED,
+        f"{path}, line {table.line}: no column {missing}",
+    )
+    for where, cells in table.cells("a dot in decimal numbers, or semicolons between"):
         answer = _answer(where, cells)
         query, rank, last = answer.query, answer.rank, answers[-1].query if answers else None
         if rank > 1 and not (query == last and rank == len(ranked[-1]) + 1):
@@ -235,9 +244,9 @@ class _Answer(NamedTuple):
 
 
 def _answer(where: str, cells: dict[str, str]) -> _Answer:
-    query = _whole(cells["query"], "query", 0, where)
-    place = _whole(cells["place"], "place", -1, where)
-    rank = _whole(cells.get("rank", "1"), "rank", 1, where)
+    query = whole(cells["query"], "query", 0, where)
+    place = whole(cells["place"], "place", -1, where)
+    rank = whole(cells.get("rank", "1"), "rank", 1, where)
     try:
         score = float(cells["score"])
     except ValueError:
@@ -255,31 +264,3 @@ def _answer(where: str, cells: dict[str, str]) -> _Answer:
         seen = f"probability is {cells['probability']!r}"
         raise InputError(f"{where}: {seen}; expected a number from 0 to 1")
     return _Answer(query, rank, place, score, accepted, probability, as_number(cells.get("confidence", "")))
-
-
-def _rows(path: Path) -> Iterator[tuple[str, dict[str, str]]]:
-    """The location of each row, for messages, and its cells by name."""
-    names: list[str] = []
-    for number, cells in read_rows(path, EXPECTED):
-        where = f"{path}, line {number}"
-        if not names:
-            names = [name.lower() for name in cells]
-            missing = [name for name in ("query", "place", "score") if name not in names]
-            if missing:
-                raise InputError(f"{where}: no column {missing[0]}; expected {EXPECTED}")
-        elif len(cells) < len(names):
-            raise InputError(f"{where}: {len(cells)} cells; expected {len(names)} as in the header")
-        elif any(cells[len(names) :]):
-            expected = (
-                f"expected {len(names)} as in the header, a dot in decimal numbers, or semicolons between"
-            )
-            raise InputError(f"{where}: {len(cells)} cells; {expected}")
-        else:
-            yield where, dict(zip(names, cells, strict=False))
-
-
-def _whole(text: str, name: str, minimum: int, where: str) -> int:
-    value = as_number(text)
-    if value is None or value % 1 or value < minimum:
-        raise InputError(f"{where}: {name} is {text!r}; expected a whole number of at least {minimum}")
-    return int(value)

@@ -6,11 +6,12 @@ import math
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from dejavu_torch.data.files import read_rows
+from dejavu_torch.data.tables import read_table
 from dejavu_torch.places.states import States
 from dejavu_torch.recognition import chosen
 from dejavu_torch.recognition.engine import Rates
@@ -113,16 +114,10 @@ def read_moved(path: Path) -> Tensor:
     Raises:
         InputError: another file.
     """
-    (_, header), *rows = read_rows(path, EXPECTED) or [(0, [""])]
-    names = [cell.strip().lower() for cell in header]
-    seen = f"{path} has the columns {', '.join(names)}, and {len(rows)} rows"
-    expect("moved" in names and rows, EXPECTED, seen)
-    found, column = list[float](), names.index("moved")
-    for line, cells in rows:
-        cell = cells[column] if column < len(cells) else ""
-        cell = "0" if not found and not cell.strip() else cell  # there is no frame before the first
-        try:
-            found.append(float(cell))
-        except ValueError as error:
-            raise InputError(f"{path}, line {line}: moved is {cell!r}; expected a number") from error
-    return torch.tensor(found, dtype=torch.float64)
+    table = read_table(path, EXPECTED)
+    expect("moved" in table and table.rows, EXPECTED, f"{table}, and {len(table)} rows")
+    cells, found = table.text("moved"), table.numbers("moved")
+    found[0] = found[0] if cells[0] else 0.0  # there is no frame before the first
+    for row in np.flatnonzero(np.isnan(found))[:1]:
+        raise InputError(f"{table.where(row)}: moved is {cells[row]!r}; expected a number")
+    return torch.from_numpy(found)

@@ -1,0 +1,171 @@
+"""A look at coordinates before they are believed: what a receiver writes without a fix is no place."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from itertools import pairwise
+
+import numpy as np
+import numpy.typing as npt
+
+from dejavu_torch.text import rounded
+
+FAR, AWAY = 20, 50.0  # steps of the usual length, and metres, beyond which a fix is far from the next one
+RARE = 0.05  # share of fixes that may be far from their neighbours; beyond, frames are in no order
+JOINED = 2  # jumps that are told: more are drives that were joined, or a raster
+MOST = 20  # rows that leave the path together
+HELD, MADE_UP = 5, 3  # rows of a fix that is held, and steps of the usual length that make up for it
+ALIKE, LEAST = 0.8, 5  # share of runs of equal fixes that have about one length, and their least number
+SLOWEST = 100  # rows between two changes of a fix
+PER_DEGREE = 111_200.0  # metres, of a meridian
+
+
+Fixes = npt.NDArray[np.float64]
+
+
+def checked_fixes(values: Fixes, degrees: bool = False, lines: Sequence[int] = ()) -> tuple[Fixes, list[str]]:
+    """Coordinates (R,2) or (R,3), NaN where they tell no place, and what was seen, in words.
+
+    Longitudes go on across 180 degrees, so that values between two rows can be interpolated. NaN become
+
+    - fixes at 0, 0 or -1, -1 that repeat and lie far from the next one, as before the first fix;
+    - fixes far off the path, of few rows, after which it goes on;
+    - all but the first of equal fixes in a row, if the next step makes up for them: they were held. A camera
+      that stops goes on from where it was.
+
+    If fixes change every k-th row, those between are interpolated. Jumps after which the path does not come
+    back are told.
+
+    Args:
+        lines: of the rows in their file, for the words; by default their numbers.
+
+    Example:
+        >>> walk = np.stack([np.arange(100.0), np.arange(100.0)], 1)
+        >>> walk[40:60] = walk[40]
+        >>> checked_fixes(walk)[1]
+        ['19 fixes from line 41 on repeat the one before, though the next one makes up for them']
+    """
+    values, seen, lines = values.copy(), list[str](), lines or range(len(values))
+    if degrees:
+        known = ~np.isnan(values[:, 1])
+        values[known, 1] = np.unwrap(values[known, 1], period=360)
+    for none in (0.0, -1.0):
+        at = (values[:, :2] == none).all(1)
+        if 2 <= at.sum() < len(values) - 1 and _far(values, at, degrees):
+            values[at] = math.nan
+            seen.append(f"{at.sum()} fixes at {none:g}, {none:g} lie far from the next one")
+    if (off := _astray(values, degrees)).any():
+        away, first = rounded(float(_steps(values, degrees).max())), lines[np.flatnonzero(off)[0]]
+        values[off] = math.nan
+        fixes = (
+            f"{off.sum()} fixes from line {first} on lie"
+            if off.sum() > 1
+            else f"the fix in line {first} lies"
+        )
+        seen.append(f"{fixes} {away} m off the path")
+    values = _held(values, degrees, seen, lines)
+    if 0 < len(jumps := _jumps(values, degrees)) <= JOINED:
+        row, away = np.flatnonzero(~np.isnan(values).any(1))[jumps[0]], _steps(values, degrees)[jumps[0]]
+        after = f"after line {lines[row]}, and does not come back"
+        seen.append(f"the path jumps {rounded(float(away))} m {after}")
+    return values, seen
+
+
+def metres(values: Fixes, degrees: bool) -> Fixes:
+    """Coordinates (R,K) in metres, near enough to compare steps."""
+    if not degrees:
+        return values
+    across = np.cos(np.radians(np.nanmean(values[:, 0]))) if len(values) else 1.0
+    found: Fixes = PER_DEGREE * values[:, :2] * [1.0, across]
+    return found
+
+
+def _steps(values: Fixes, degrees: bool) -> Fixes:
+    """The length in metres of the steps between fixes that are known, one after the other."""
+    known = values[~np.isnan(values).any(1)]
+    lengths: Fixes = np.linalg.norm(np.diff(metres(known, degrees), axis=0), axis=1)
+    return lengths
+
+
+def _usual(values: Fixes, degrees: bool) -> float:
+    """The usual length of a step that is one; 0 if there is none."""
+    steps = _steps(values, degrees)
+    return float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.0
+
+
+def _far(values: Fixes, at: npt.NDArray[np.bool_], degrees: bool) -> bool:
+    """Whether the fixes of a mask lie far from all others that follow them, or from those before."""
+    others = ~at & ~np.isnan(values).any(1)
+    if not others.any():
+        return False
+    limit = max(AWAY, FAR * _usual(values[others], degrees))
+    none, *path = metres(np.concatenate([values[at][:1], values[others]]), degrees)
+    order = np.searchsorted(np.flatnonzero(others), np.flatnonzero(at))
+    next_to = np.unique(np.minimum(order, len(path) - 1))
+    return bool((np.linalg.norm(np.array(path)[next_to] - none, axis=1) > limit).all())
+
+
+def _jumps(values: Fixes, degrees: bool) -> list[int]:
+    """The fixes that are known, by their order, after which comes a step that is no vehicle's; none if there
+    are many."""
+    steps, apart = _steps(values, degrees), np.diff(np.flatnonzero(~np.isnan(values).any(1)))
+    jumps = np.flatnonzero(steps > apart * max(AWAY, FAR * _usual(values, degrees))).tolist()
+    return jumps if len(steps) >= 2 * LEAST and len(jumps) <= max(2, RARE * len(steps)) else []
+
+
+def _astray(values: Fixes, degrees: bool) -> npt.NDArray[np.bool_]:
+    """Which fixes lie far off a path that goes on after them, (R,) bool: between two steps that are no
+    vehicle's, in few rows."""
+    off = np.zeros(len(values), dtype=bool)
+    jumps = _jumps(values, degrees)
+    if not jumps:
+        return off
+    rows = np.flatnonzero(~np.isnan(values).any(1))
+    at, usual = metres(values[rows], degrees), _usual(values, degrees)
+    limit = max(AWAY, FAR * usual)
+    # a jump before the first fix, and one after the last, as if the path went on there
+    ends = [-1] * (jumps[0] < LEAST), [len(rows) - 1] * (jumps[-1] >= len(rows) - 1 - LEAST)
+    jumps, alone = [*ends[0], *jumps, *ends[1]], len(jumps) == 1
+    for before, after in pairwise(jumps):
+        if before < 0 or after == len(rows) - 1:
+            goes_on = alone
+        else:
+            away = np.linalg.norm(at[after + 1] - at[before])
+            near = away <= limit + MADE_UP * usual * (after - before)
+            goes_on = after - before <= MOST and bool(near)
+        if goes_on and not off[rows[max(before, 0)]]:
+            off[rows[before + 1 : after + 1]] = True
+    return off
+
+
+def _held(values: Fixes, degrees: bool, seen: list[str], lines: Sequence[int]) -> Fixes:
+    """Values without fixes that are held; see `checked_fixes`."""
+    known = np.flatnonzero(~np.isnan(values).any(1))
+    if len(known) < 2:
+        return values
+    own = values[known]
+    starts = np.concatenate([[0], np.flatnonzero((np.diff(own, axis=0) != 0).any(1)) + 1])
+    lengths = np.diff(np.append(starts, len(own)))
+    every = float(np.median(lengths[:-1])) if len(lengths) > 1 else 0.0
+    near = np.abs(lengths[1:-1] - every) <= max(1.0, every / 10)
+    if 2 <= every <= SLOWEST and len(lengths) > LEAST and near.mean() >= ALIKE:
+        between = np.arange(starts[-1] + 1)
+        for column in own.T:
+            column[between] = np.interp(between, starts, column[starts])
+        values = values.copy()
+        values[known] = own
+        seen.append(f"fixes change every {every:g} lines; those between are interpolated")
+        return values
+    usual, held = _usual(values, degrees), np.zeros(len(values), dtype=bool)
+    at = metres(own[starts], degrees)
+    after = np.append(np.linalg.norm(np.diff(at, axis=0), axis=1), 0.0)
+    for start, length, step in zip(starts, lengths, after, strict=True):
+        if length >= HELD and step > max(MADE_UP, length / MADE_UP) * usual:
+            held[known[start + 1 : start + length]] = True
+    if held.any():
+        values = values.copy()
+        values[held] = math.nan
+        fixes = f"{held.sum()} fixes from line {lines[np.flatnonzero(held)[0]]} on"
+        seen.append(f"{fixes} repeat the one before, though the next one makes up for them")
+    return values
