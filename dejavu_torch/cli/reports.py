@@ -20,8 +20,7 @@ from dejavu_torch.cli.commands import (
 from dejavu_torch.cli.device import device_of
 from dejavu_torch.data.output import check_output_file, check_output_folder, whole_folder
 from dejavu_torch.data.source import check_not_read, open_source
-from dejavu_torch.evaluation.answers import describe_line
-from dejavu_torch.evaluation.doubts import doubt_lines
+from dejavu_torch.evaluation.doubts import contradiction, doubt_lines
 from dejavu_torch.evaluation.options import UNREAD, Reporting, several
 from dejavu_torch.model import DejaVu
 from dejavu_torch.model_file import recipe_of
@@ -207,7 +206,7 @@ def run_evaluate(
     with report_folder(out) as folder:
         title = f"{short_name(matches)} evaluated by {short_name(truth)}"
         write_report(folder, result.report, result.pictures, title, command)
-    _print_contradiction(result.report)
+    _print_doubts(result.report)
     if recall_values:
         recalls = result.report.facts["recall_values"]
         print(", ".join(f"R@{first}: {100 * recall:.1f}" for first, recall in recalls.items()))
@@ -299,7 +298,7 @@ def _publish_found(
     from dejavu_torch.evaluation.report import found_lines, report_folder, write_report
 
     run, kept = found.run, out / "map.safetensors"
-    _print_contradiction(found.report)
+    _print_doubts(found.report)
     if verbose:
         _print_run(run)
     match = run.match
@@ -349,10 +348,8 @@ def _print_run(run: Localization) -> None:
         print(acceptance)
 
 
-def _print_contradiction(report: Report) -> None:
+def _print_doubts(report: Report) -> None:
     """Say first if the answers contradict the ground truth, and what else is doubtful."""
-    if report.ours.scores is not None and (line := describe_line(report.facts, True)):
-        say(line)
     for doubt in doubt_lines(report.facts):
         say(doubt)
 
@@ -369,7 +366,7 @@ def _print_scores(report: Report, out: Path) -> None:
     if report.ours.scores is not None:
         say(page.verdict(report))
     else:
-        if line := describe_line(report.facts, False):
+        if line := contradiction(report.facts, False):
             say(line)
         if steps := page.steps_after(report.facts):
             say(f"next: {steps}")

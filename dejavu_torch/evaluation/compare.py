@@ -387,9 +387,9 @@ def _told(plan: Plan, run: Localization, ranked: Match, off_map: dict[str, Tenso
         **({"headings": headings} if headings > 1 else {}),
         **view_facts(run),
         **metric_facts(run, truth),
-        **doubt_facts(doubts_of(run)),
         **({"second": views.placed_facts()} if views is not None and views.placed else {}),
     }
+    facts |= doubt_facts(doubts_of(run, truth, facts))
     pictures = draw_pictures(run, {"map": ours}) | draw_reliability(run.scored, run.truth, run.tolerance)
     return Comparison(Report(ours, {}, facts), pictures, run, ranked)
 

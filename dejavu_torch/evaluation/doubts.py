@@ -5,13 +5,55 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import Any
 
+from torch import Tensor
+
+from dejavu_torch.data.coordinates import Near, coordinates_of
+from dejavu_torch.data.ground_truth import Truth, check_ground_truth, scored_and_right
+from dejavu_torch.evaluation.agreement import Ground, Judged, contradictions
+from dejavu_torch.evaluation.answers import MIN_WIDTH, describe_line
 from dejavu_torch.evaluation.localization import Localization
-from dejavu_torch.types import Doubt, Facts
+from dejavu_torch.motion.resampling import source_of
+from dejavu_torch.types import Doubt, Facts, Match, Traverse
+
+CONTRADICT = "the answers contradict the truth"
 
 
-def doubts_of(run: Localization) -> list[Doubt]:
-    """What is doubtful about a run with its answers."""
-    return []
+def doubts_of(run: Localization, truth: Truth | None, facts: Mapping[str, Any]) -> list[Doubt]:
+    """What is doubtful about a run with its answers, of which `facts` tell a line or shift."""
+    if run.truth is None or run.querying.loops is not None:
+        return []
+    place_map = run.model.map
+    match, alone = (one.renumbered(place_map.frame_of) for one in (run.match, run.judged))
+    scored, right = scored_and_right(run.scored.index, run.truth, run.tolerance)
+    places, within = len(source_of(run.reference)), max(run.tolerance, MIN_WIDTH)
+    asked = Judged(match, run.query_frames, right, scored, within, facts["truth"], places)
+    if run.answers == "drive":
+        asked = asked._replace(alone=alone.index)
+    ground = ground_of(truth, source_of(run.reference), source_of(run.query), match, run.query_frames)
+    return compared(asked, ground, facts)
+
+
+def ground_of(
+    truth: Truth | None, reference: Traverse | None, query: Traverse | None, match: Match, queries: Tensor
+) -> Ground | None:
+    """What a truth by coordinates compares, of answers and queries (Q,) in frames; None for another truth."""
+    near = None if truth is None else check_ground_truth(truth)
+    if not isinstance(near, Near) or reference is None or query is None:
+        return None
+    stored, own = coordinates_of([reference, query], near.kind)
+    names, times = (reference.name, query.name), query.times
+    second = None if times is None or len(times) < 2 else float(times[-1] - times[0]) / (len(times) - 1)
+    return Ground(near, stored[match.index], own[queries], stored, own, names, second)
+
+
+def compared(asked: Judged, ground: Ground | None, facts: Mapping[str, Any]) -> list[Doubt]:
+    """What makes answers agree with the truth; else the line or shift of most of them that `facts` tell."""
+    doubts = contradictions(asked, ground)
+    if not any(str(doubt).startswith(CONTRADICT) for doubt in doubts) and (
+        line := describe_line(facts, True)
+    ):
+        doubts.append(Doubt("line" if "line" in facts else "shift", line))
+    return doubts
 
 
 def doubt_facts(doubts: Iterable[Doubt]) -> Facts:
@@ -22,3 +64,9 @@ def doubt_facts(doubts: Iterable[Doubt]) -> Facts:
 def doubt_lines(facts: Mapping[str, Any]) -> list[str]:
     """The doubts of report.json in words, a line each."""
     return [str(Doubt(**doubt)) for doubt in facts.get("doubts", ())]
+
+
+def contradiction(facts: Mapping[str, Any], scored: bool) -> str:
+    """How answers contradict the truth, if they do; of answers that are not scored, the line of most."""
+    lines = (line for line in doubt_lines(facts) if line.startswith(CONTRADICT))
+    return next(lines, "") if scored else describe_line(facts, False)

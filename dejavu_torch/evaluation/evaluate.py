@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from dejavu_torch.data.arrays import ArrayTraverse
-from dejavu_torch.data.coordinates import Near, coordinates_of
+from dejavu_torch.data.coordinates import Near
 from dejavu_torch.data.ground_truth import (
     GroundTruth,
     check_ground_truth,
@@ -25,10 +25,13 @@ from dejavu_torch.data.ground_truth import (
     is_right,
     of_loops,
     offset_of,
+    scored_and_right,
 )
 from dejavu_torch.evaluation import curves
-from dejavu_torch.evaluation.answers import answer_facts, shift_facts
+from dejavu_torch.evaluation.agreement import Judged
+from dejavu_torch.evaluation.answers import MIN_WIDTH, answer_facts, shift_facts
 from dejavu_torch.evaluation.contenders import contend
+from dejavu_torch.evaluation.doubts import compared, doubt_facts, ground_of
 from dejavu_torch.evaluation.match_plots import draw_coverage
 from dejavu_torch.evaluation.matches import ELSEWHERE, read_matches
 from dejavu_torch.evaluation.options import REACH
@@ -169,10 +172,13 @@ def evaluate_file(
     facts = evaluation_facts(match, candidates, known, tolerance, positions, described) | alone
     if near is not None and layout.units:
         facts |= {"tolerance": plain_number(near.radius), "unit": layout.units}
-    if near is not None and loops is None and reference is not None and query is not None:
-        stored, own = coordinates_of([reference, query], near.kind)
-        found = here.index if place_map is None else place_map.frame_of(here.index)
-        facts |= shift_facts(near, here, stored[found], own[queries])
+    if loops is None:
+        found = here if place_map is None else here.renumbered(place_map.frame_of)
+        ground = ground_of(truth, reference, query, found, queries)
+        facts |= {} if ground is None else shift_facts(ground.near, here, ground.found, ground.asked)
+        judged, right = scored_and_right(match.index, known, tolerance)
+        one = Judged(found, queries, right, judged, max(tolerance, MIN_WIDTH), described, places)
+        facts |= doubt_facts(compared(one, ground, facts))
     accepted = facts["accepted"]
     facts["accepted_precision"] = facts["accepted_right"] / accepted if accepted else None
     facts |= {"matches": str(matches), "places": places}

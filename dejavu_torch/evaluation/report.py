@@ -14,9 +14,9 @@ from textwrap import wrap
 from typing import Any, NamedTuple
 
 from dejavu_torch.data.output import whole_folder
-from dejavu_torch.evaluation.answers import describe_line, describe_probable, next_steps
+from dejavu_torch.evaluation.answers import describe_probable, next_steps
 from dejavu_torch.evaluation.contenders import Contender, colour_of, distinct, sequences_as_json
-from dejavu_torch.evaluation.doubts import doubt_lines
+from dejavu_torch.evaluation.doubts import contradiction, doubt_lines
 from dejavu_torch.evaluation.plots import Picture, Pictures
 from dejavu_torch.evaluation.prose import sentences, templates
 from dejavu_torch.evaluation.rejection import rejection_table
@@ -74,7 +74,7 @@ class Report(NamedTuple):
         scores = ", ".join(f"{name} {value}" for name, value in zip(*rows[:2], strict=True) if name)
         others = f"; compared with {', '.join(self.contenders)}" if self.contenders else ""
         first = summary(self).partition(". ")[0].rstrip(".")
-        line = describe_line(self.facts, bool(scores))
+        line = "" if scores else contradiction(self.facts, False)
         lines = [first, f"{scores}{others}", line, *doubt_lines(self.facts), "all of report.json: as_json()"]
         return "\n".join(filter(None, lines))
 
@@ -232,7 +232,7 @@ def _sentences(report: Report, part: str) -> str:
         ours=report.ours,
         scores=scores,
         baseline=report.contenders.get("uncompressed"),
-        line=describe_line(facts, scores is not None),
+        line=contradiction(facts, scores is not None),
         probable=describe_probable(counts, facts["queries"]) if counts else "",
         likely=counts[f"{PROBABLE:g}"] / max(1, facts["queries"]) if counts else None,
         steps=steps_after(facts),

@@ -1,0 +1,349 @@
+"""What would make sure answers agree with a ground truth that rejects them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from dejavu_torch.data.coordinates import Near
+from dejavu_torch.evaluation.answers import OVER_CHANCE, confident
+from dejavu_torch.text import rounded
+from dejavu_torch.types import Doubt, Match
+
+SURE = 0.9  # probability of answers that are believed, where they have one
+LEAST = 20  # of them, at different queries and places
+REJECTED, EXPLAINED = 0.2, 0.9  # shares: of them that the truth rejects; that a relation makes right
+SPREADS = 3.0  # of what is left, by which its mean is beyond chance
+AS_WELL = 0.02  # share of the answers by which a simpler relation may explain fewer
+PAIRS, SOME = 2000, 500  # of answers that propose a relation; answers that judge it
+STEEPEST, SIMPLE = 30.0, 12  # places a query; whole slopes that are tried
+AT_ENDS = 0.05  # share of the answers that a shift in time may leave without coordinates
+RUN = 15  # consecutive answers whose median tells an offset that changes
+STRAY = 1.2  # of the way from its first value to its last, that such an offset may take
+TURN, STRETCH = 1.0, 0.01  # degrees, and share, below which coordinates are merely moved
+SIZES = 5.0  # radii over which answers must spread, for a motion of coordinates
+SHOWN, ABOVE, FULL = 0.1, 5.0, 0.5  # share of single images that agree with a drive; of chance; of the rest
+
+
+class Relation(NamedTuple):
+    """place = slope x query + offset, within some frames of which `answers` of `confident` answers lie; or
+    offsets that grow from the first to the `last`, at a slope of one, either way."""
+
+    slope: float
+    offset: float
+    answers: int
+    confident: int
+    last: float | None = None
+
+    @property
+    def explains(self) -> bool:
+        return self.answers >= EXPLAINED * self.confident
+
+    def __str__(self) -> str:
+        if self.last is not None:
+            sign = "query" if self.slope > 0 else "- query"
+            return f"place = {sign} + an offset that goes from {self.offset:.0f} to {self.last:.0f}"
+        back, factor = self.slope < 0, "" if abs(self.slope) == 1 else f"{abs(self.slope):.4g} "
+        if back:
+            return f"place = {self.offset:.0f} - {factor}query"
+        by = f" {'-' if self.offset < 0 else '+'} {abs(self.offset):.0f}" * (abs(self.offset) >= 0.5)
+        return f"place = {factor}query{by}"
+
+
+class Ground(NamedTuple):
+    """Coordinates that a truth compares, in one frame, (...,2) or (...,3) float64, NaN where unknown.
+
+    found: (Q,K) of the answers. asked: (Q,K) of the queries. stored: (N,K) of all reference frames, own:
+    (F,K) of all frames of the query's source; names: of both. second: mean seconds between the latter, None
+    if unknown.
+    """
+
+    near: Near
+    found: Tensor
+    asked: Tensor
+    stored: Tensor
+    own: Tensor
+    names: tuple[str, str]
+    second: float | None = None
+
+
+class Judged(NamedTuple):
+    """Answers that a truth judges, in frames of the sources: (Q,) each, but for `alone`, places that single
+    images report, which speak for a drive or against it; None if they are the answers. within: frames."""
+
+    match: Match
+    queries: Tensor
+    right: Tensor
+    judged: Tensor
+    within: int
+    truth: str
+    places: int | None = None
+    alone: Tensor | None = None
+
+    def sure(self) -> Tensor:
+        """Numbers of the answers that are believed; none unless they are many, of many places."""
+        sure = self.match.probability
+        chosen = confident(self.match) if sure is None else sure >= SURE
+        numbers = (chosen & self.judged & (self.match.index >= 0)).nonzero()[:, 0]
+        distinct = min(len(one[numbers].unique()) for one in (self.match.index, self.queries))
+        return numbers if distinct >= LEAST and self._shown(numbers) else numbers[:0]
+
+    def _shown(self, numbers: Tensor) -> bool:
+        """Whether single images agree with a drive more often than by chance, as they do not elsewhere."""
+        if self.alone is None or self.places is None:
+            return True
+        near = (self.alone[numbers] - self.match.index[numbers]).abs() <= self.within
+        chance = min(1.0, (2 * self.within + 1) / max(1, self.places))
+        least = min(max(SHOWN, ABOVE * chance), chance + FULL * (1 - chance))
+        return bool(near.double().mean() >= least)
+
+
+def contradictions(asked: Judged, ground: Ground | None = None) -> list[Doubt]:
+    """Relations that make sure answers right which the truth rejects, or by which all of them differ from it.
+    Several that explain as many are told together."""
+    numbers = asked.sure()
+    if not len(numbers):
+        return []
+    rejected = float((~asked.right[numbers]).double().mean()) > REJECTED
+    if ground is None:
+        relation = (
+            relation_of(asked.match.index[numbers], asked.queries[numbers], asked.within)
+            if rejected
+            else None
+        )
+        return [] if relation is None or not relation.explains else [_of_frames(relation, asked)]
+    return _of_coordinates(asked, numbers, ground, rejected)
+
+
+def relation_of(places: Tensor, queries: Tensor, within: int) -> Relation | None:
+    """The relation near which most answers lie; None if they are no more than with pairs drawn at random.
+
+    Example:
+        >>> queries = torch.arange(60)
+        >>> str(relation_of(6 * queries + 3, queries, within=5))
+        'place = 6 query + 3'
+    """
+    x, y = queries.double(), places.double()
+    some = torch.linspace(0, len(x) - 1, min(SOME, len(x))).round().long()
+    draw = torch.Generator().manual_seed(0)
+    one, other = torch.randint(len(x), (2, PAIRS), generator=draw)
+    run = x[other] - x[one]
+    slope = (y[other] - y[one]) / run
+    kept = (run.abs() >= (x.max() - x.min()) / 5) & (run != 0) & (slope.abs() <= STEEPEST) & (slope != 0)
+    if not kept.any():
+        return None
+    offset = (y[one] - slope * x[one])[kept]
+
+    def near(slope: Tensor | float, offset: Tensor | float) -> Tensor:
+        return (y - slope * x - offset).abs() <= within
+
+    counts = ((y[some] - slope[kept][:, None] * x[some] - offset[:, None]).abs() <= within).sum(1)
+    best = int(counts.argmax())
+    at, start = float(slope[kept][best]), float(offset[best])
+    for _ in range(3):  # least squares of what lies near it
+        own = near(at, start)
+        if own.sum() < 2 or len(x[own].unique()) < 2:
+            break
+        middle, height = x[own].mean(), y[own].mean()
+        at = float(((x[own] - middle) * (y[own] - height)).sum() / (x[own] - middle).square().sum())
+        start = float(height - at * middle)
+    answers = int(near(at, start).sum())
+    simple = [sign * k for k in range(1, SIMPLE + 1) for sign in (1.0, -1.0)]
+    for straight in sorted([*simple, *(1 / one for one in simple[2:])], key=lambda one: abs(one - at))[:1]:
+        level = float((y - straight * x)[near(at, start)].median()) if answers else start
+        if (as_many := int(near(straight, level).sum())) >= answers - AS_WELL * len(x):
+            at, start, answers = straight, level, as_many
+    by_chance = (
+        float(((y[None, some] - at * x[some, None] - start).abs() <= within).sum()) / len(some) / len(some)
+    )
+    found = Relation(at, start, answers, len(x))
+    plain = found if answers > OVER_CHANCE * by_chance * len(x) else None
+    growing = _growing(x, y, within)
+    return growing if growing and growing.answers > answers + AS_WELL * len(x) else plain
+
+
+def _growing(x: Tensor, y: Tensor, within: int) -> Relation | None:
+    """An offset that only grows, or only falls, from the first query on, as where frames are missing."""
+    order = x.argsort(stable=True)
+    x, y = x[order], y[order]
+    if len(x) < 2 * RUN:
+        return None
+    for slope in (1.0, -1.0):
+        offset = y - slope * x
+        runs = offset.unfold(0, RUN, 1).median(1).values
+        middle = torch.cat([runs[:1].expand(RUN // 2), runs, runs[-1:].expand(len(x) - len(runs) - RUN // 2)])
+        near = int(((offset - middle).abs() <= within).sum())
+        way = float((runs[-1] - runs[0]).abs())
+        if near >= EXPLAINED * len(x) and float(runs.diff().abs().sum()) <= STRAY * way and way > within:
+            return Relation(slope, float(runs[0]), near, len(x), float(runs[-1]))
+    return None
+
+
+def _of_frames(relation: Relation, asked: Judged) -> Doubt:
+    """A relation between numbers of frames in words, with what would make the truth agree."""
+    many = f"{relation.answers} of {relation.confident} confident answers"
+    text = f"the answers contradict the truth ({asked.truth}): {many} follow {relation}"
+    first, last = int(asked.queries.min()), int(asked.queries.max())
+    ends = [f"{query},{max(0, round(relation.slope * query + relation.offset))}" for query in (first, last)]
+    in_file = f"--interpolate and --truth FILE.csv with the lines {ends[0]} and {ends[1]}"
+    if relation.last is not None:
+        what = "frames are missing, or their rates differ; pair frames by name or time in a --truth FILE.csv"
+        return Doubt("offset", f"{text}: {what}")
+    if relation.slope == 1.0:
+        return Doubt("offset", text, f"--truth {relation.offset:.0f}")
+    if relation.slope < 0:
+        return Doubt("backwards", f"{text}: the queries run backwards", in_file)
+    if 0.8 < relation.slope < 1.25:
+        grown = [relation.offset + (relation.slope - 1) * query for query in (first, last)]
+        text += (
+            f", so the offset goes from {grown[0]:.0f} to {grown[1]:.0f}: frames are missing, or rates differ"
+        )
+    return Doubt("rate", text, in_file)
+
+
+class Motion(NamedTuple):
+    """A similarity of the plane, found = turn x asked + move, as complex numbers; of the mirrored asked, if
+    `mirrored`. near: (n,) bool, the answers that it makes right."""
+
+    turn: complex
+    move: complex
+    mirrored: bool
+    near: Tensor
+
+    def __str__(self) -> str:
+        angle, size = math.degrees(math.atan2(self.turn.imag, self.turn.real)), abs(self.turn)
+        exchanged = self.mirrored and abs(angle - 90) < TURN
+        parts = {
+            "with x and y exchanged": exchanged,
+            "mirrored": self.mirrored and not exchanged,
+            f"turned by {angle:.1f} degrees": abs(angle) >= TURN and not exchanged,
+            f"scaled by {size:.4g}": abs(size - 1) >= STRETCH,
+            _vector(self.move.real, self.move.imag): abs(self.move) >= 0.05,
+        }
+        return " and ".join(part for part, applies in parts.items() if applies)
+
+
+def motion_of(found: Tensor, asked: Tensor, radius: float, mirrored: bool = False) -> Motion | None:
+    """The similarity that brings most points (n,2) of queries within a radius of those of their answers."""
+    a, f = (torch.complex(one[:, 0], one[:, 1]) for one in (asked, found))
+    a = a.conj() if mirrored else a
+    some = torch.linspace(0, len(a) - 1, min(SOME, len(a))).round().long()
+    draw = torch.Generator().manual_seed(0)
+    one, other = torch.randint(len(a), (2, PAIRS), generator=draw)
+    run = a[other] - a[one]
+    kept = run.abs() > max(2 * radius, float(run.abs().median()) / 2)
+    if not kept.any():
+        return None
+    turn = ((f[other] - f[one])[kept] / run[kept]).resolve_conj()
+    move = f[one][kept] - turn * a[one][kept]
+    counts = ((turn[:, None] * a[some] + move[:, None] - f[some]).abs() <= radius).sum(1)
+    best = int(counts.argmax())
+    c, t = turn[best], move[best]
+    for _ in range(3):
+        near = (c * a + t - f).abs() <= radius
+        if near.sum() < 2:
+            return None
+        middle, height = a[near].mean(), f[near].mean()
+        c = ((a[near] - middle).conj() * (f[near] - height)).sum() / (a[near] - middle).abs().square().sum()
+        t = height - c * middle
+    near = (c * a + t - f).abs() <= radius
+    by_chance = float(((c * a[some, None] + t - f[None, some]).abs() <= radius).double().mean())
+    spread = float((f[near] - f[near].mean()).abs().max()) if near.any() else 0.0
+    plain = float(near.double().mean()) >= OVER_CHANCE * by_chance and spread >= SIZES * radius
+    return Motion(complex(c), complex(t), mirrored, near) if plain else None
+
+
+def _of_coordinates(asked: Judged, numbers: Tensor, ground: Ground, rejected: bool) -> list[Doubt]:
+    """What makes answers and coordinates agree, in words."""
+    radius, unit = ground.near.radius, ground.near.unit
+    found, own = ground.found[numbers, :2], ground.asked[numbers, :2]
+    known = (found.isfinite() & own.isfinite()).all(1)
+    found, own, queries = found[known], own[known], asked.queries[numbers][known]
+    if len(found) < LEAST:
+        return []
+    left = found - own
+    middle = left.median(0).values
+    away, spread = float(middle.norm()), float((left - middle).norm(dim=1).median())
+    moved = f"{_vector(*middle.tolist())} {unit}"
+    if not rejected:
+        if away > max(SPREADS * spread, radius / 2):
+            seen = (
+                f"the confident answers lie {rounded(away)} {unit} from the coordinates of their queries, in"
+            )
+            seen = f"{seen} one direction, with a spread of {rounded(spread)} {unit}"
+            return [Doubt("shift", f"{seen}: they agree if those of {ground.names[1]} are {moved}")]
+        return []
+    ways: list[tuple[int, str, str]] = []  # answers that each explains, its kind, and words
+    if (near := int(((left - middle).norm(dim=1) <= radius).sum())) >= EXPLAINED * len(found):
+        ways.append((near, "shift", moved))
+    for relation in _rows(found, queries, ground):
+        if relation.explains:
+            ways.append((relation.answers, "clock", _clock(relation, ground)))
+    if not ways:
+        for mirrored in (False, True):
+            motion = motion_of(found, own, radius, mirrored)
+            if motion is not None and int(motion.near.sum()) >= EXPLAINED * len(found):
+                own_frames = all(_at_origin(table) for table in (ground.stored, ground.own))
+                both = ", as both begin at 0, 0" * own_frames
+                ways.append((int(motion.near.sum()), "frame", f"{motion}{both}"))
+    exchanged = _exchanged(asked.match.index[numbers], asked.queries[numbers], ground, radius)
+    if exchanged >= EXPLAINED * len(numbers):
+        ways.append((exchanged, "exchanged", "with the two files exchanged"))
+    if not ways:
+        return []
+    best = max(ways)[0]
+    words = [(kind, way) for count, kind, way in ways if count >= best - AT_ENDS * len(found)]
+    many = f"{best} of {len(numbers)} confident answers agree with the coordinates of {ground.names[1]}"
+    text = f"the answers contradict the truth ({asked.truth}): {many} {', or '.join(way for _, way in words)}"
+    return [Doubt(words[0][0], text)]
+
+
+def _rows(found: Tensor, queries: Tensor, ground: Ground) -> Iterator[Relation]:
+    """How numbers of queries are related to the frames whose coordinates are those of the answers."""
+    own = ground.own[:, :2]
+    rows = own.isfinite().all(1).nonzero()[:, 0]
+    if len(rows) < LEAST:
+        return
+    distance, nearest = zip(*(torch.cdist(part, own[rows]).min(1) for part in found.split(256)), strict=True)
+    near = torch.cat(distance) <= ground.near.radius
+    if near.sum() < LEAST:
+        return
+    at, step = rows[torch.cat(nearest)], own[rows].diff(dim=0).norm(dim=1)
+    usual = float(step[step > 0].median()) if (step > 0).any() else 1.0
+    within = max(1, math.ceil(ground.near.radius / max(usual, 1e-9)))
+    relation = relation_of(at[near], queries[near], min(within, len(rows) // 10))
+    if relation is not None and not (relation.slope == 1 and relation.last is None and relation.offset == 0):
+        yield relation._replace(confident=len(found))
+
+
+def _clock(relation: Relation, ground: Ground) -> str:
+    """A relation between queries and the frames whose coordinates they should have, in words."""
+    if relation.last is not None:
+        return f"if its rows are {-relation.offset:.0f} to {-relation.last:.0f} frames later"
+    rate = f"{abs(relation.slope):.4g} times as fast" * (abs(relation.slope) != 1)
+    if how := " and ".join(filter(None, ["backwards" * (relation.slope < 0), rate])):
+        return f"if its rows run {how}"
+    later = "earlier" if relation.offset > 0 else "later"
+    if ground.second is None:
+        return f"{abs(relation.offset):.0f} frames {later}"
+    return f"if its times are {abs(relation.offset) * ground.second:.1f} s {later}"
+
+
+def _exchanged(places: Tensor, queries: Tensor, ground: Ground, radius: float) -> int:
+    """How many answers are right if the reference has the coordinates of the query, and the reverse."""
+    fits = (places < len(ground.own)) & (queries < len(ground.stored))
+    one, other = ground.own[places[fits]], ground.stored[queries[fits]]
+    return int(((one - other).norm(dim=1) <= radius).sum())
+
+
+def _at_origin(table: Tensor) -> bool:
+    known = table[table.isfinite().all(1)]
+    return bool(len(known) and (known[0].abs() < 1e-9).all())
+
+
+def _vector(x: float, y: float) -> str:
+    return f"moved by ({x:.1f}, {y:.1f})"
