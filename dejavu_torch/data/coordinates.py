@@ -115,6 +115,7 @@ def read_coordinates(path: Path, traverse: Traverse) -> tuple[Coordinates, Tenso
     table = read_table(path, EXPECTED)
     expect(table.rows or table.header, EXPECTED, f"{path} has no rows")
     columns, degrees, height = _columns(table)
+    table = table.distinct() if "time" in table else table
     turns = "heading" in table
     columns += [table.at("heading")] if turns else []
     table.check_width(max(columns) + 1)

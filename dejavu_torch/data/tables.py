@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -18,6 +18,9 @@ ALIKE = {
     "name": "filename file_name file image image_name image_file img frame_name path image_path",
     "time": "timestamp stamp t sec secs seconds second unix_time",
     "nsec": "nanosec nsecs nanoseconds",
+    "query": "query_idx query_index query_id query_frame q_idx",
+    "place": "place_idx place_index reference ref ref_idx ref_index ref_id reference_index match_idx",
+    "score": "distance dist cost",
     "frame": "frame_id frame_number frame_index",
     "x": "tx p_x pos_x position_x p_rs_r_x",
     "y": "ty p_y pos_y position_y p_rs_r_y",
@@ -47,16 +50,19 @@ class Table:
     """Rows of cells with the names of their columns.
 
     Attributes:
-        header: its columns; empty without one. rows: line number and cells of each
-            line, but for the header. line: number of that of the header.
+        header: its columns; empty without one. rows: line number and cells of each line, but for the header.
+        line: number of that of the header. used: numbers of the columns that are asked for, or need not be.
     """
 
     def __init__(
-        self, path: Path, header: Sequence[Column], rows: list[tuple[int, list[str]]], at: int = 1
+        self,
+        path: Path,
+        header: Sequence[Column],
+        rows: list[tuple[int, list[str]]],
+        line: int = 1,
+        used: Iterable[int] = (),
     ) -> None:
-        self.path, self.header, self.rows = path, list(header), rows
-        self.line = at
-        self.used: set[int] = set()
+        self.path, self.header, self.rows, self.line, self.used = path, [*header], rows, line, {*used}
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -67,6 +73,11 @@ class Table:
     def named(self, *roles: str) -> None:
         """Name the first columns of a table without a header."""
         self.header = [Column("", role) for role in roles]
+
+    def distinct(self) -> Table:
+        """Without rows that repeat the cells of the one before, as of messages that were written twice."""
+        rows = [row for i, row in enumerate(self.rows) if not i or row[1] != self.rows[i - 1][1]]
+        return Table(self.path, self.header, rows, self.line, self.used)
 
     def where(self, row: int) -> str:
         """The line of a row, for messages."""
@@ -95,8 +106,8 @@ class Table:
             expect(len(cells) >= width, f"{width} or more", f"{self.where(row)}: {len(cells)} columns")
 
     def cells(self, expected: str) -> Iterator[tuple[str, dict[str, str]]]:
-        """The line of each row, for messages, and its cells by the titles of their columns."""
-        names = [column.title for column in self.header]
+        """The line of each row, for messages, and its cells by what their columns hold."""
+        names = [column.role for column in self.header]
         for row, (_, cells) in enumerate(self.rows):
             seen = f"{self.where(row)}: {len(cells)} cells"
             expect(len(cells) >= len(names), f"{len(names)} as in the header", seen)
@@ -128,11 +139,11 @@ def read_table(path: Path, expected: str) -> Table:
         re.split("[,;\t]+", ",".join(cells).lstrip("#%, ")) for _, cells in rows if cells[0][:1] == "#"
     ]
     rows = [row for row in rows if row[1][0][:1] != "#"]
-    titles, at = list[str](), 1
+    titles, at, known = list[str](), 1, False
     if rows and all(math.isnan(number(cell)) and cell.lower() != "nan" for cell in rows[0][1] if cell):
         at, titles = rows.pop(0)
     elif rows and comments and len(comments[-1]) == len(rows[0][1]):
-        titles = comments[-1]
+        titles, known = comments[-1], True  # as in files of a standard form
     titles = [title.strip(" %").lower() for title in titles]
     columns = [column_of(title) for title in titles]
     taken: set[str] = set()
@@ -141,7 +152,7 @@ def read_table(path: Path, expected: str) -> Table:
         if column.role in taken or not plain:
             columns[i] = Column(column.title, column.title, column.unit)
         taken.add(columns[i].role)
-    return Table(path, columns, rows, at)
+    return Table(path, columns, rows, at, range(len(columns)) if known else ())
 
 
 def column_of(title: str) -> Column:

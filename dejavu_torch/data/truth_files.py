@@ -21,6 +21,8 @@ from dejavu_torch.types import InputError, Traverse, expect
 
 log = logging.getLogger("dejavu_torch")
 
+FEW, PART = 10, 5  # queries, and parts of a visit of which a file tells one, that look like seconds
+FEW, PART = 10, 5  # queries, and parts of a visit of which a file tells one, that look like seconds
 Listed = dict[int, list[float]]  # the places of each query in a file
 
 
@@ -79,13 +81,21 @@ def until(listed: Listed, query: Traverse | None, reference: Traverse | None, na
     return kept or listed
 
 
+def look_like_seconds(listed: Listed, queries: int, frames: int) -> bool:
+    """Whether the numbers of a file count something longer than frames: from 0 on, without a gap, but over a
+    small part of both visits."""
+    places = [place for places in listed.values() for place in places]
+    consecutive = len(listed) >= FEW and sorted(listed) == [*range(len(listed))]
+    return consecutive and bool(places) and PART * len(listed) < queries and PART * max(places) < frames
+
+
 def read_csv(path: Path, frames: int | None, interpolate: bool) -> Listed:
     """The places of lines of query,place[,place...]."""
     table = read_table(path, "lines of query,place")
-    names = [column.title for column in table.header]
+    names, titles = [one.role for one in table.header], ",".join(one.title for one in table.header)
     # any other column, such as a distance, would be read as a right place
     fits = not names or (names[0] == "query" and all(re.match("place|$", name) for name in names[1:]))
-    expect(fits, "query,place[,place...]", f"{path}, line {table.line}: columns {','.join(names)}")
+    expect(fits, "query,place[,place...]", f"{path}, line {table.line}: columns {titles}")
     end, valid = (LARGEST, "0") if frames is None else (frames, f"0 to {frames - 1}")
     listed: Listed = {}
     for line, cells in table.rows:

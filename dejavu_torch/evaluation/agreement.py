@@ -22,7 +22,10 @@ AS_WELL = 0.02  # share of the answers by which a simpler relation may explain f
 PAIRS, SOME = 2000, 500  # of answers that propose a relation; answers that judge it
 STEEPEST, SIMPLE = 30.0, 12  # places a query; whole slopes that are tried
 AT_ENDS = 0.05  # share of the answers that a shift in time may leave without coordinates
+CHANGES = 5  # of a value that was rounded
+FLOOR, FEW = 2.0, 1500  # metres that a floor is above another, at least; places that are looked at
 RUN = 15  # consecutive answers whose median tells an offset that changes
+GROWN = 0.5  # of the queries, by which an offset may grow
 STRAY = 1.2  # of the way from its first value to its last, that such an offset may take
 TURN, STRETCH = 1.0, 0.01  # degrees, and share, below which coordinates are merely moved
 SIZES = 5.0  # radii over which answers must spread, for a motion of coordinates
@@ -46,10 +49,10 @@ class Relation(NamedTuple):
     def __str__(self) -> str:
         if self.last is not None:
             sign = "query" if self.slope > 0 else "- query"
-            return f"place = {sign} + an offset that goes from {self.offset:.0f} to {self.last:.0f}"
+            return f"place = {sign} + an offset that goes from {round(self.offset)} to {round(self.last)}"
         back, factor = self.slope < 0, "" if abs(self.slope) == 1 else f"{abs(self.slope):.4g} "
         if back:
-            return f"place = {self.offset:.0f} - {factor}query"
+            return f"place = {round(self.offset)} - {factor}query"
         by = f" {'-' if self.offset < 0 else '+'} {abs(self.offset):.0f}" * (abs(self.offset) >= 0.5)
         return f"place = {factor}query{by}"
 
@@ -59,7 +62,7 @@ class Ground(NamedTuple):
 
     found: (Q,K) of the answers. asked: (Q,K) of the queries. stored: (N,K) of all reference frames, own:
     (F,K) of all frames of the query's source; names: of both. second: mean seconds between the latter, None
-    if unknown.
+    if unknown. height: the column of heights, of three.
     """
 
     near: Near
@@ -69,6 +72,58 @@ class Ground(NamedTuple):
     own: Tensor
     names: tuple[str, str]
     second: float | None = None
+    height: int = 2
+
+
+def coarse(ground: Ground) -> list[Doubt]:
+    """Coordinates that cannot tell what a radius asks for: with few digits, or of floors within it."""
+    radius, unit, doubts = ground.near.radius, ground.near.unit, list[Doubt]()
+    for name, table in dict(zip(ground.names, (ground.stored, ground.own), strict=True)).items():
+        known = table[table.isfinite().all(1), :2]
+        for axis, title in enumerate("xy"):
+            if (size := _rounded_to(known, axis)) > radius / 2:
+                seen = f"the {title} of {name} are multiples of {rounded(size)} {unit}"
+                doubts.append(Doubt("digits", f"{seen}, too coarse for a distance of {radius:g} {unit}"))
+    floors = _floors(torch.cat([ground.stored, ground.own]), ground.height, radius)
+    if floors:
+        seen = f"places lie {rounded(floors)} {unit} above others, all within {radius:g} {unit} of a query"
+        expected = f"--truth {ground.near.kind}:{floors / 2:.2g}"
+        doubts.append(Doubt("heights", f"{seen}: a smaller distance tells floors apart", expected))
+    return doubts
+
+
+def _rounded_to(path: Tensor, axis: int) -> float:
+    """The number that all values of an axis are multiples of, if a path (n,2) was rounded to it; else 0. Of a
+    path along streets or a grid each step goes on, and values change in several steps one after the other."""
+    values, steps = path[:, axis].unique(), path.diff(dim=0)
+    if len(values) < 3:
+        return 0.0
+    size = float(values.diff().min())
+    even = [
+        bool(((one / size) - (one / size).round()).abs().max() < 1e-3) for one in (values.diff(), *steps.T)
+    ]
+    moves = steps[:, axis] != 0
+    alone = moves[1:-1] & ~moves[:-2] & ~moves[2:]
+    goes_on = all(even) and bool((steps != 0).any(1).all())
+    rounded_off = int(alone.sum()) >= max(CHANGES, EXPLAINED * int(moves[1:-1].sum()))
+    return size if even[0] and rounded_off and not goes_on else 0.0
+
+
+def _floors(places: Tensor, height: int, radius: float) -> float:
+    """How far floors lie above each other, if some lie within a radius; else 0."""
+    places = places[places.isfinite().all(1)]
+    if places.shape[1] < 3 or len(places) < LEAST:
+        return 0.0
+    some = places[torch.linspace(0, len(places) - 1, min(FEW, len(places))).round().long()]
+    ground = [axis for axis in range(3) if axis != height]
+    near = torch.cdist(some[:, ground], some[:, ground]) <= min(radius / 5, FLOOR)
+    above = (some[:, None, height] - some[None, :, height]).abs()[near]
+    higher = above[above >= FLOOR]
+    if len(higher) < LEAST or (gap := float(higher.median())) > radius:
+        return 0.0
+    among = above[above >= FLOOR / 2]
+    alike = ((among - gap).abs() <= 0.3 * gap).double().mean()  # else heights merely vary
+    return gap if float(alike) >= EXPLAINED else 0.0
 
 
 class Judged(NamedTuple):
@@ -172,13 +227,15 @@ def _growing(x: Tensor, y: Tensor, within: int) -> Relation | None:
     x, y = x[order], y[order]
     if len(x) < 2 * RUN:
         return None
+    most = GROWN * float(x[-1] - x[0])
     for slope in (1.0, -1.0):
         offset = y - slope * x
         runs = offset.unfold(0, RUN, 1).median(1).values
+        steps = runs[:: RUN // 2].diff().abs().sum()
         middle = torch.cat([runs[:1].expand(RUN // 2), runs, runs[-1:].expand(len(x) - len(runs) - RUN // 2)])
         near = int(((offset - middle).abs() <= within).sum())
         way = float((runs[-1] - runs[0]).abs())
-        if near >= EXPLAINED * len(x) and float(runs.diff().abs().sum()) <= STRAY * way and way > within:
+        if near >= EXPLAINED * len(x) and float(steps) <= STRAY * way + within and within < way <= most:
             return Relation(slope, float(runs[0]), near, len(x), float(runs[-1]))
     return None
 
@@ -194,14 +251,13 @@ def _of_frames(relation: Relation, asked: Judged) -> Doubt:
         what = "frames are missing, or their rates differ; pair frames by name or time in a --truth FILE.csv"
         return Doubt("offset", f"{text}: {what}")
     if relation.slope == 1.0:
-        return Doubt("offset", text, f"--truth {relation.offset:.0f}")
+        return Doubt("offset", text, f"--truth {round(relation.offset)}")
     if relation.slope < 0:
         return Doubt("backwards", f"{text}: the queries run backwards", in_file)
     if 0.8 < relation.slope < 1.25:
         grown = [relation.offset + (relation.slope - 1) * query for query in (first, last)]
-        text += (
-            f", so the offset goes from {grown[0]:.0f} to {grown[1]:.0f}: frames are missing, or rates differ"
-        )
+        text += f", so the offset goes from {round(grown[0])} to {round(grown[1])}"
+        text += ": frames are missing, or rates differ"
     return Doubt("rate", text, in_file)
 
 
@@ -323,7 +379,7 @@ def _rows(found: Tensor, queries: Tensor, ground: Ground) -> Iterator[Relation]:
 def _clock(relation: Relation, ground: Ground) -> str:
     """A relation between queries and the frames whose coordinates they should have, in words."""
     if relation.last is not None:
-        return f"if its rows are {-relation.offset:.0f} to {-relation.last:.0f} frames later"
+        return f"if its rows are {round(-relation.offset)} to {round(-relation.last)} frames later"
     rate = f"{abs(relation.slope):.4g} times as fast" * (abs(relation.slope) != 1)
     if how := " and ".join(filter(None, ["backwards" * (relation.slope < 0), rate])):
         return f"if its rows run {how}"

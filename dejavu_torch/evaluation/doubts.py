@@ -9,7 +9,7 @@ from torch import Tensor
 
 from dejavu_torch.data.coordinates import Near, coordinates_of
 from dejavu_torch.data.ground_truth import Truth, check_ground_truth, scored_and_right
-from dejavu_torch.evaluation.agreement import Ground, Judged, contradictions
+from dejavu_torch.evaluation.agreement import Ground, Judged, coarse, contradictions
 from dejavu_torch.evaluation.answers import MIN_WIDTH, describe_line
 from dejavu_torch.evaluation.localization import Localization
 from dejavu_torch.motion.resampling import source_of
@@ -43,7 +43,8 @@ def ground_of(
     stored, own = coordinates_of([reference, query], near.kind)
     names, times = (reference.name, query.name), query.times
     second = None if times is None or len(times) < 2 else float(times[-1] - times[0]) / (len(times) - 1)
-    return Ground(near, stored[match.index], own[queries], stored, own, names, second)
+    height = 2 if reference.coordinates is None else reference.coordinates.height
+    return Ground(near, stored[match.index], own[queries], stored, own, names, second, height)
 
 
 def compared(asked: Judged, ground: Ground | None, facts: Mapping[str, Any]) -> list[Doubt]:
@@ -53,7 +54,7 @@ def compared(asked: Judged, ground: Ground | None, facts: Mapping[str, Any]) -> 
         line := describe_line(facts, True)
     ):
         doubts.append(Doubt("line" if "line" in facts else "shift", line))
-    return doubts
+    return doubts + ([] if ground is None else coarse(ground))
 
 
 def doubt_facts(doubts: Iterable[Doubt]) -> Facts:
@@ -68,5 +69,5 @@ def doubt_lines(facts: Mapping[str, Any]) -> list[str]:
 
 def contradiction(facts: Mapping[str, Any], scored: bool) -> str:
     """How answers contradict the truth, if they do; of answers that are not scored, the line of most."""
-    lines = (line for line in doubt_lines(facts) if line.startswith(CONTRADICT))
-    return next(lines, "") if scored else describe_line(facts, False)
+    lines = (line for line in doubt_lines(facts) if scored and line.startswith(CONTRADICT))
+    return next(lines, "") or describe_line(facts, scored)

@@ -156,7 +156,7 @@ def read_matches(
     """Read the matches in a csv, from any method.
 
     Args:
-        path: a csv whose header has these columns; others are ignored.
+        path: a csv whose header has these columns, also by other usual names; others are ignored.
             query: number of the query frame, in any order, each once; in consecutive lines with ranks, or
             with `repeats`. place: number of the reported reference frame, -1 for none. score: lower is
             better, inf for none.
@@ -181,13 +181,8 @@ def read_matches(
     seen: set[int] = set()
     named: dict[str, None] = {}
     table = read_table(path, EXPECTED)
-    titles = [column.title for column in table.header]
-    missing = next((name for name in ("query", "place", "score") if name not in titles), None)
-    expect(
-        missing is None or not (titles or len(table)),
-        EXPECTED,
-        f"{path}, line {table.line}: no column {missing}",
-    )
+    for name in ("query", "place", "score") if table.header or table.rows else ():
+        expect(name in table, EXPECTED, f"{path}, line {table.line}: no column {name}")
     for where, cells in table.cells("a dot in decimal numbers, or semicolons between"):
         answer = _answer(where, cells)
         query, rank, last = answer.query, answer.rank, answers[-1].query if answers else None

@@ -106,6 +106,114 @@ def test_what_is_refused(text, words, tmp_path):
         values(text, ArrayTraverse(torch.rand(2, 4), "two"), tmp_path)
 
 
+FIRST = 1305031102
+
+
+@pytest.fixture(scope="module")
+def counted(tmp_path_factory):
+    return images(tmp_path_factory.mktemp("n") / "counted", *(f"{i:06}.png" for i in range(12)))
+
+
+@pytest.fixture(scope="module")
+def stamped(tmp_path_factory):
+    return images(tmp_path_factory.mktemp("n") / "stamped", *(f"{FIRST + i / 4:.2f}.png" for i in range(12)))
+
+
+def lines(form, count=12):
+    return "\n".join(form(i) for i in range(count))
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "stamp,x,y\n" + lines(lambda i: f"{FIRST + i / 4},{i},0"),
+        "timestamp_ns,x,y\n" + lines(lambda i: f"{FIRST * 10**9 + i * 250_000_000},{i},0"),
+        "sec,nsec,x,y\n" + lines(lambda i: f"{FIRST + i // 4},{i % 4 * 250_000_000},{i},0"),
+        "field.header.stamp,field.pose.position.x,field.pose.position.y\n"
+        + lines(lambda i: f"{FIRST * 10**9 + i * 250_000_000},{i},0"),
+        "time,x,y\n" + lines(lambda i: f"{FIRST + i / 4},{i},0\n{FIRST + i / 4},{i},0"),  # written twice
+    ],
+)
+def test_times_by_any_name_and_unit(text, stamped, tmp_path):
+    np.testing.assert_allclose(
+        values(text, open_source(stamped), tmp_path), [[i, 0] for i in range(12)], atol=1e-5
+    )
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "filename,x,y\n" + "\n".join(f"left/{i:06}.jpg,{i},0" for i in reversed(range(12))),
+        "frame,x,y\n" + "\n".join(f"{i},{i},0" for i in reversed(range(12))),
+        "t,x,y\n" + lines(lambda i: f"{i / 10},{i},0"),  # times of frames that have none: a row a frame
+        "x [cm],y [cm]\n" + lines(lambda i: f"{100 * i},0"),
+    ],
+)
+def test_frames_by_name_or_number(text, counted, tmp_path):
+    np.testing.assert_allclose(values(text, open_source(counted), tmp_path), [[i, 0] for i in range(12)])
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("frame,x,y\n" + "\n".join(f"{i},{i},0" for i in range(1, 13)), ("1 frames beyond", "count from 1?")),
+        ("frame,x,y\n" + lines(lambda i: f"{i},{i},0", 15), ("3 frames beyond", "12", "0 to 11")),
+        ("frame,x,y\n" + lines(lambda i: f"{min(i, 4)},{i},0"), ("frame 4 twice",)),
+        ("frame,x,y\n" + lines(lambda i: f"{i / 2},{i},0"), ("line 3", "0.5", "whole number")),
+        ("name,x,y\n" + lines(lambda i: f"{min(i, 4):06}.png,{i},0"), ("line 7", "000004.png", "line 6")),
+        (
+            "t,x,y\n" + lines(lambda i: f"{i / 10},{i},0", 30),
+            ("no times within", "0 to 2.9 s", "a row a frame"),
+        ),
+        ("x,y\n" + lines(lambda i: f"{i},0", 15), ("15 rows", "12 frames")),
+    ],
+)
+def test_rows_that_fit_no_frames_are_refused(text, words, counted, tmp_path):
+    with refused(*words):
+        values(text, open_source(counted), tmp_path)
+
+
+def test_times_of_another_clock_or_of_few_digits_are_refused(stamped, tmp_path):
+    with refused("0 to 2.75 s", "1305031102 to 1305031104.75 s", "one clock"):
+        values("time,x,y\n" + lines(lambda i: f"{i / 4},{i},0"), open_source(stamped), tmp_path)
+    with refused("10 times twice", "lines 2 and 3 both have 1305031040 s", "more digits"):
+        rounded = [float(np.float32(FIRST + i / 4)) for i in range(12)]
+        values("time,x,y\n" + lines(lambda i: f"{rounded[i]:.1f},{i},0"), open_source(stamped), tmp_path)
+
+
+def test_what_is_not_used_and_what_is_no_fix_are_told(counted, tmp_path, caplog):
+    text = "lat,lon,sats\n" + lines(lambda i: f"{48 + 1e-5 * i},11,7" if i > 3 else "0,0,0")
+    found = values(text, open_source(counted), tmp_path)
+    assert [row[0] for row in found][4:] == [48 + 1e-5 * i for i in range(4, 12)]
+    assert np.isnan(found[:4]).all()
+    assert "the column sats is not used" in caplog.text
+    assert "4 fixes at 0, 0" in caplog.text
+    assert "4 of 12 frames have no coordinates" in caplog.text
+
+
+def test_longitudes_between_rows_across_180_degrees(stamped, tmp_path):
+    text = "time,lat,lon\n" + "\n".join(
+        f"{FIRST + i},-17,{(179.9995 + i * 1e-3 + 180) % 360 - 180}" for i in range(4)
+    )
+    found = np.array(values(text, open_source(stamped), tmp_path))[:, 1] % 360
+    np.testing.assert_allclose(found, 179.9995 + 2.5e-4 * np.arange(12), atol=1e-7)
+
+
+def test_heights_are_compared_only_if_both_visits_have_them(tmp_path, caplog):
+    """Poses of KITTI have the height in the second of three numbers, and down."""
+    three = ArrayTraverse(torch.rand(3, 4), "poses")
+    two = ArrayTraverse(torch.rand(3, 4), "gps")
+    (tmp_path / "p.txt").write_text("\n".join(f"1 0 0 {i} 0 1 0 -7 0 0 1 {10 * i}" for i in range(3)))
+    (tmp_path / "g.csv").write_text("x,y\n" + "\n".join(f"{i},{10 * i}" for i in range(3)))
+    three.coordinates, _ = read_coordinates(tmp_path / "p.txt", three)
+    two.coordinates, _ = read_coordinates(tmp_path / "g.csv", two)
+    one, other = coordinates_of([three, two], "metres")
+    assert one.tolist() == other.tolist() == [[0, 0], [1, 10], [2, 20]]
+    assert "gps has coordinates of two numbers" in caplog.text
+    one, other = coordinates_of([three, three], "metres")
+    assert one[1].tolist() == [1, -7, 10]
+
+
 def test_parts_and_chains_keep_coordinates(tmp_path):
     (tmp_path / "w.csv").write_text("x,y\n" + "\n".join(f"{i},0" for i in range(9)))
     np.save(tmp_path / "f.npy", np.random.default_rng(0).random((9, 5), np.float32))

@@ -680,3 +680,33 @@ def test_a_table_wider_than_the_memory_is_refused(tmp_path, monkeypatch):
         read(path, None, 2000)
     with refused("1500 places for each of 30000 queries", "GB free"):
         near_truth(torch.zeros(1500, 2), torch.zeros(30_000, 2), radius=1.0)
+
+
+def frames_of(count):
+    return ArrayTraverse(torch.rand(count, 4), f"{count} frames")
+
+
+def test_rows_beyond_the_last_frame_are_refused_but_for_a_stop(tmp_path, caplog):
+    def ask(text, query, reference=None):
+        (tmp_path / "truth.csv").write_text(text)
+        return find_ground_truth(tmp_path / "truth.csv", reference, query, 8, len(query))
+
+    long = "\n".join(f"{i},{min(i, 7)}" for i in range(10))
+    with refused("lists 2 queries beyond the last frame: 8 to 9", "0 to 7"):
+        ask(long, frames_of(8))
+    with refused("query 8", "count from 1?"):
+        ask("\n".join(f"{i},{min(i, 7)}" for i in range(1, 9)), frames_of(8))
+    truth = ask(long, frame_range(frames_of(10), stop=8))
+    assert truth.positives.tolist() == [[i] for i in range(8)]
+    assert "2 of its right places lie beyond a stop" in caplog.text
+    truth = ask("0,3\n1,9\n2,5\n", frames_of(3), frame_range(frames_of(10), stop=8))
+    assert truth.positives.tolist() == [[3], [-1], [5]]
+
+
+def test_numbers_that_look_like_seconds_are_told(tmp_path, caplog):
+    (tmp_path / "truth.csv").write_text("\n".join(f"{i},{i}" for i in range(20)))
+    find_ground_truth(tmp_path / "truth.csv", None, frames_of(600), 500, 600)
+    assert "ends at query 19 of 600 and place 19 of 500: does it count seconds" in caplog.text
+    caplog.clear()
+    find_ground_truth(tmp_path / "truth.csv", None, frames_of(20), 500, 20)
+    assert not caplog.text

@@ -1,0 +1,250 @@
+"""What would make sure answers agree with a truth that rejects them, and when nobody should ask."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import pytest
+import torch
+from command_line import run
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dejavu_torch import compare
+from dejavu_torch.data.arrays import ArrayTraverse
+from dejavu_torch.data.coordinates import Near
+from dejavu_torch.evaluation.agreement import Ground, Judged, coarse, contradictions, motion_of, relation_of
+from dejavu_torch.evaluation.evaluate import ANYWHERE, evaluate_file
+from dejavu_torch.evaluation.report import verdict
+from dejavu_torch.types import Coordinates, Match
+
+Q = torch.arange(300)
+TURN = torch.tensor([[math.cos(0.7), -math.sin(0.7)], [math.sin(0.7), math.cos(0.7)]]).double()
+
+
+def road(s):
+    """A drawn road with bends, by place number: metres."""
+    s = torch.as_tensor(s).double()
+    return torch.stack([3 * s, 60 * torch.sin(s / 60) + 0.0015 * s**2], 1)
+
+
+def judged(places, truth, queries=Q, tolerance=5, sure=0.95, **more):
+    """Answers at places, where a truth says others."""
+    probability = torch.full((len(places),), sure)
+    match = Match(places, torch.zeros(len(places)), torch.ones(len(places), dtype=torch.bool), probability)
+    right = (places - truth).abs() <= tolerance
+    return Judged(match, queries, right, torch.ones_like(right), max(tolerance, 5), "truth.csv", 300, **more)
+
+
+def told(*args, **more):
+    return [(doubt.kind, str(doubt)) for doubt in contradictions(judged(*args, **more))]
+
+
+@pytest.mark.parametrize(
+    ("places", "kind", "words"),
+    [
+        (Q + 40, "offset", ("300 of 300", "place = query + 40", "--truth 40")),
+        (Q - 17, "offset", ("place = query - 17", "--truth -17")),
+        (6 * Q, "rate", ("place = 6 query:", "lines 0,0 and 299,1794")),
+        (Q // 4, "rate", ("place = 0.25 query",)),
+        ((1.13 * Q).round().long(), "rate", ("place = 1.13 query", "from 0 to 39")),
+        ((Q * 30 / 28).round().long(), "rate", ("place = 1.07", "rates differ")),
+        (299 - Q, "backwards", ("place = 299 - query", "run backwards", "lines 0,299 and 299,0")),
+        (600 - 2 * Q, "backwards", ("place = 600 - 2 query",)),
+        (Q + 20 * (Q // 75), "offset", ("goes from 0 to 60", "frames are missing", "by name or time")),
+        (Q + 60 * (Q >= 150), "offset", ("goes from 0 to 60",)),
+        (400 - Q - 15 * (Q // 75), "offset", ("place = - query", "goes from 400 to 355")),
+    ],
+)
+@pytest.mark.parametrize("share", [0.0, 0.06])
+def test_a_relation_between_frames_is_told(places, kind, words, share):
+    """With some answers anywhere, and jitter of a frame."""
+    noise = torch.Generator().manual_seed(1)
+    places = places + torch.randint(-1, 2, (300,), generator=noise)
+    lost = torch.randperm(300, generator=noise)[: round(share * 300)]
+    places[lost] = torch.randint(0, 300, (len(lost),), generator=noise)
+    ((found, text),) = told(places.clamp(min=0), Q)
+    assert found == kind
+    assert text.startswith("the answers contradict the truth (truth.csv)")
+    for word in words if not share else ():
+        assert word.replace("300 of", f"{300 - len(lost)} of") in text
+
+
+@given(st.floats(0.2, 4.0), st.integers(-200, 200), st.integers(0, 2**16))
+def test_a_line_is_found_within_its_width(slope, offset, seed):
+    noise = torch.Generator().manual_seed(seed)
+    places = (slope * Q + offset).round().long() + torch.randint(-2, 3, (300,), generator=noise)
+    relation = relation_of(places, Q, 5)
+    assert relation is not None
+    assert relation.explains
+    assert relation.last is None
+    assert relation.slope * 150 + relation.offset == pytest.approx(slope * 150 + offset, abs=6)
+
+
+@pytest.mark.parametrize(
+    ("places", "truth", "more"),
+    [
+        (Q, Q, {}),  # they agree
+        (Q + 5, Q, {}),  # within the tolerance
+        (torch.randperm(300, generator=torch.Generator().manual_seed(0)), Q, {}),  # an honest failure
+        (torch.where(Q % 10 < 1, (7 * Q) % 300, Q), Q, {}),  # a tenth is wrong
+        (torch.where(Q < 150, Q, (7 * Q) % 300), Q, {}),  # half of it anywhere
+        (Q + 50 * ((Q >= 100) & (Q < 200)), Q, {}),  # a third at a place that looks alike
+        (torch.full_like(Q, 70), Q, {}),
+        (Q + 40, Q, {"sure": 0.8}),
+        (Q + 40, Q, {"alone": torch.randperm(300, generator=torch.Generator().manual_seed(0))}),  # elsewhere
+    ],
+    ids=["right", "near", "anywhere", "tenth", "half", "alike", "one place", "unsure", "single images deny"],
+)
+def test_where_nothing_explains_nothing_is_told(places, truth, more):
+    assert not told(places, truth, **more)
+
+
+def test_few_answers_tell_nothing():
+    assert not told(Q[:19] + 40, Q[:19], Q[:19])
+    assert told(Q[:20] + 40, Q[:20], Q[:20])
+
+
+def grounds(stored, own, places=Q, radius=12.5, names=("a.csv", "b.csv"), second=None):
+    """Answers at places by coordinates of both visits, and what a truth by distance says of them."""
+    near, found, asked = Near("metres", radius), stored[places], own[Q]
+    right = (found - asked).norm(dim=1) <= radius
+    one = judged(places, Q)._replace(right=right, truth="within 12.5 m")
+    return one, Ground(near, found, asked, stored, own, names, second)
+
+
+PATH = road(Q)
+
+
+@pytest.mark.parametrize(
+    ("stored", "own", "more", "kind", "words"),
+    [
+        (PATH, (PATH - PATH[50]) @ TURN.T, {}, "frame", ("turned by -40.1 degrees and moved by (150",)),
+        (PATH - PATH[0], (PATH - PATH[0]) @ TURN.T, {}, "frame", ("both begin at 0, 0",)),
+        (PATH, PATH.fliplr(), {}, "frame", ("with x and y exchanged",)),
+        (PATH, 1.1 * PATH, {}, "frame", ("scaled by 0.909",)),
+        (PATH, PATH * torch.tensor([1.0, -1.0]), {}, "frame", ("mirrored",)),
+        (PATH, road(Q + 18), {"second": 1.0}, "clock", ("18.0 s later",)),
+        (PATH, road(Q - 18), {"second": 0.5}, "clock", ("9.0 s earlier",)),
+        (PATH, road(Q + 18), {}, "clock", ("18 frames later",)),
+        (PATH, PATH.flip(0), {}, "clock", ("rows run backwards",)),
+        (PATH, road(1.05 * Q), {}, "clock", ("0.95", "times as fast")),
+        (PATH, PATH + torch.tensor([0.0, 40.0]), {}, "shift", ("moved by (0.0, -40.0) m",)),
+        (PATH, PATH + torch.tensor([0.0, 12.0]), {}, "shift", ("lie 12 m from", "moved by (0.0, -12.0) m")),
+        (road(Q + 30), PATH, {"places": (Q - 30).clamp(min=0)}, None, ()),  # right, but for the first
+        (PATH, road(Q + 30), {"places": (Q - 30).clamp(min=0)}, "exchanged", ("two files exchanged",)),
+    ],
+)
+def test_coordinates_that_agree_another_way(stored, own, more, kind, words):
+    if kind in ("exchanged", None):  # query q is at place q + 30 of the reference, if files are as they are
+        places = (Q - 30) if kind is None else Q + 30
+        keep = (places >= 0) & (places < 300)
+        stored, own = (stored, PATH) if kind is None else (road(Q + 30), PATH)
+        near = Near("metres", 12.5)
+        shown = places.clamp(0, 299)
+        found = road(shown + 30)
+        if kind is None:
+            one, ground = grounds(stored, own, shown)
+        else:
+            one, ground = grounds(stored, own, shown)
+        one = one._replace(judged=keep)
+        ground = ground._replace(near=near, found=found)
+    else:
+        one, ground = grounds(stored, own, **more)
+    doubts = contradictions(one, ground)
+    assert [doubt.kind for doubt in doubts] == ([] if kind is None else [kind])
+    for word in words:
+        assert word in str(doubts[0])
+
+
+def test_where_several_explain_they_are_named_together():
+    """A straight road at constant speed: moved, or late."""
+    path = torch.stack([3.0 * Q, 0.0 * Q], 1).double()
+    one, ground = grounds(path, path + torch.tensor([54.0, 0.0]), second=0.1)
+    (doubt,) = contradictions(one, ground)
+    assert "moved by (-54.0, 0.0) m, or if its times are 1.8 s later" in doubt.text
+
+
+@pytest.mark.parametrize("case", ["noise", "anywhere", "half", "one place", "a bend away"])
+def test_coordinates_of_honest_answers_tell_nothing(case):
+    draw = torch.Generator().manual_seed(0)
+    places = {
+        "noise": Q,
+        "anywhere": torch.randperm(300, generator=draw),
+        "half": torch.where(Q % 2 == 0, Q, (7 * Q) % 300),
+        "one place": torch.full_like(Q, 9),
+        "a bend away": torch.where(Q < 120, Q, 419 - Q),
+    }[case]
+    own = PATH + 2 * torch.randn(300, 2, generator=draw).double()
+    assert not contradictions(*grounds(PATH, own, places))
+
+
+def test_a_small_place_has_no_motion():
+    """Points within a few radii fit any motion."""
+    points = 10 * torch.rand(60, 2, generator=torch.Generator().manual_seed(0)).double()
+    assert motion_of(points @ TURN.T, points, 12.5) is None
+    assert motion_of(10 * points @ TURN.T, 10 * points, 2.5) is not None
+
+
+def test_coordinates_too_coarse_for_the_radius():
+    way = road(Q / 2) + 5_326_000
+    coarse_of = {
+        "ten": torch.stack([way[:, 0], (way[:, 1] / 10).round() * 10], 1),
+        "plain": way,
+        "a frame every ten metres": torch.stack([10.0 * Q, 0.0 * Q], 1).double(),
+        "a grid": 10.0 * torch.cartesian_prod(torch.arange(15), torch.arange(20)).double(),
+    }
+    for name, own in coarse_of.items():
+        _, ground = grounds(way, own, radius=5.0)
+        doubts = coarse(ground)
+        assert [doubt.kind for doubt in doubts] == ["digits"] * (name == "ten")
+    _, ground = grounds(way, coarse_of["ten"], radius=25.0)
+    assert not coarse(ground)
+    assert "the y of b.csv are multiples of 10 m" in str(
+        coarse(grounds(way, coarse_of["ten"], radius=5.0)[1])[0]
+    )
+
+
+@pytest.mark.parametrize(
+    ("above", "radius", "floors"),
+    [(4.0, 5.0, True), (4.0, 3.0, False), (0.0, 5.0, False), (None, 25.0, False)],
+)
+def test_floors_within_the_radius(above, radius, floors):
+    """None: heights of a receiver, which merely vary."""
+    draw = torch.Generator().manual_seed(0)
+    height = torch.full((300,), above or 0.0) if above is not None else 4 * torch.randn(300, generator=draw)
+    one = torch.cat([PATH, torch.zeros(300, 1)], 1)
+    other = torch.cat([PATH, height[:, None]], 1)
+    _, ground = grounds(one, other, radius=radius)
+    doubts = coarse(ground)
+    assert [doubt.kind for doubt in doubts] == ["heights"] * floors
+    assert not floors or ("4 m above" in str(doubts[0]) and "--truth metres:2" in str(doubts[0]))
+
+
+def test_a_report_tells_it_first(tmp_path, capsys):
+    """On the terminal, at the top of the page, and in report.json; the verdict is not that of the map."""
+    rows = torch.nn.functional.normalize(
+        torch.randn(300, 16, generator=torch.Generator().manual_seed(0)), dim=1
+    )
+    reference, query = ArrayTraverse(rows, "a"), ArrayTraverse(rows.clone(), "b")
+    reference.coordinates, query.coordinates = Coordinates(PATH), Coordinates((PATH - PATH[50]) @ TURN.T)
+    found = compare(reference, query, "metres:25", tolerance=5)
+    (doubt,) = found.report.facts["doubts"]
+    assert doubt["kind"] == "frame"
+    assert "turned by -40.1 degrees" in doubt["text"]
+    assert "which the answers contradict" in verdict(found.report)
+    assert doubt["text"] in repr(found.report)
+    query.coordinates = Coordinates(PATH)
+    assert compare(reference, query, "metres:25", tolerance=5).report.facts["doubts"] == []
+    answers = "\n".join(f"{i},{6 * i},{0.1}" for i in range(40))
+    (tmp_path / "m.csv").write_text(f"query_idx,ref_idx,distance\n{answers}\n")
+    assert (
+        "place = 6 query"
+        in evaluate_file(tmp_path / "m.csv", "0", 3, ANYWHERE).report.facts["doubts"][0]["text"]
+    )
+    run("evaluate", tmp_path / "m.csv", "--truth", "0", "--out", tmp_path / "scores")
+    assert capsys.readouterr().out.startswith("the answers contradict the truth (place = query)")
+    page = (tmp_path / "scores" / "index.html").read_text()
+    assert page.index("place = 6 query") < page.index("<details>")
+    assert json.loads((tmp_path / "scores" / "report.json").read_text())["doubts"][0]["kind"] == "rate"
