@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from importlib import import_module
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, cast
 
 import torch
 from torch import Tensor, nn
@@ -21,13 +21,17 @@ from torch import Tensor, nn
 from dejavu_torch.data.output import check_output_file, whole_file
 from dejavu_torch.features.extract import in_mode, moved_features
 from dejavu_torch.features.preprocess import Preprocess
+from dejavu_torch.maps.place_map import PlaceMap
 from dejavu_torch.maps.spectral_map import SpectralMap, scores_of
 from dejavu_torch.model import DejaVu, require_map
+from dejavu_torch.recognition import chosen
 from dejavu_torch.recognition.calibration import POWER
 from dejavu_torch.recognition.calibration import TOLERANCE as BEYOND
 from dejavu_torch.recognition.centring import running_mean
+from dejavu_torch.recognition.online import UNKNOWN, Nearness
 from dejavu_torch.recognition.querying import Sequences
 from dejavu_torch.recognition.scorer import OfMap
+from dejavu_torch.recognition.taken import DRAWN, FAITHFUL
 from dejavu_torch.recognition.views import ALONE, Views
 from dejavu_torch.text import one_line
 from dejavu_torch.types import Facts, InputError, SequenceModel, expect
@@ -39,6 +43,8 @@ MAX_BYTES = 2**31 - 2**24  # of the constants: protobuf files are smaller than 2
 TOLERANCE = 1e-3  # maximum difference to torch's scores, relative above 1
 MAX_SIZE = 2**16  # frames of a batch, pixels of a side
 TRIED = 3  # frames that the file is tested on
+SEEDS = 8  # draws of the dimensions that are mirrored: one may leave a map as it is
+DEVIATION = 0.16, 0.5, 0.84  # quantiles a standard deviation below and above the median, and that
 MAX_REASON = 200  # characters of an error of torch
 
 
@@ -168,7 +174,8 @@ def export_onnx(
         model: with a map. A spectral map is decoded: the file holds the float32 descriptors of all places.
         path: of the file, which is written only if onnxruntime reproduces torch's scores.
         sequence: a `SequenceMatcher` or a `PlaceFilter`. The file then maps one frame and the state before it
-            to scores and the next state, see `SequenceModel.step`.
+            to scores and the next state, see `SequenceModel.step`; that of a filter has counts of how
+            near frames came to the map, see `nearness_of`.
         centre: remove the mean of the frames so far from each, see `RunningMean`, which is a state as well.
         shifts: views of each frame, of which the best has the scores; "auto" are those that the map knows.
 
@@ -179,8 +186,9 @@ def export_onnx(
 
     Convention: the metadata's entry "dejavu_torch" is JSON: names and shapes of inputs and outputs, the
         number of places, and if there is one, the threshold, the calibration for single frames, the step
-        between places of a resampled map, and the number that fills the first state of a sequence. Places
-        are those of the map. Frames are not checked: NaN gives NaN.
+        between places of a resampled map, the number that fills the first state of a sequence, and how many
+        numbers at the front of a filter's state count. Places are those of the map. Frames are not checked:
+        NaN gives NaN.
 
     Raises:
         InputError: no map, a part that cannot be exported, different scores of the exported model, onnx or
@@ -209,6 +217,8 @@ def export_onnx(
     size = 4 * model.map.places * model.map.dimension if isinstance(model.map, SpectralMap) else 0
     seen = f"{model.map.places} places of {model.map.dimension} dimensions need {size / 1e9:.1f} GB"
     expect(size <= MAX_BYTES, f"at most {MAX_BYTES / 1e9:.1f} GB in an ONNX file", seen)
+    if sequence is not None and sequence.answers == "filter":
+        sequence = sequence.having(nearness=nearness_of(model.map))
     device = model.map.device
     images = len(model.frame_shape) == 3
     views = model.views_at_first(Sequences(shifts=shifts), images, learns=False)
@@ -234,6 +244,22 @@ def export_onnx(
     with whole_file(path) as temporary:
         temporary.write_bytes(written)
     return Exported(facts, len(written), difference)
+
+
+@torch.no_grad()
+def nearness_of(place_map: PlaceMap) -> Nearness:
+    """What a filter needs to learn how near queries come to a map: how near its own places come if they are
+    mirrored. `UNKNOWN` of maps whose single images are not asked whether a drive is one of the map, see
+    `OfMap.null`."""
+    if place_map.fidelity is None or place_map.fidelity < FAITHFUL:
+        return UNKNOWN
+    known = cast(SpectralMap, place_map)
+    step = max(1, known.places * SEEDS // DRAWN)
+    some = torch.cat([known.decode(g)[::step] for g in range(len(known.chunks))])
+    scorer = OfMap(known, some[:: max(1, len(some) * SEEDS // DRAWN)])  # of chunks, too, there may be many
+    best = [scorer.mirrored(part, seed).amin(1) for seed in range(SEEDS) for part in scorer.parts()]
+    low, off, high = torch.cat(best).cpu().quantile(torch.tensor(DEVIATION)).tolist()  # few may be dark
+    return Nearness(off, (high - low) / 2, chosen.BINS) if high > low else UNKNOWN
 
 
 def session_of(file: str | bytes, threads: int = 0) -> Any:
@@ -284,6 +310,7 @@ def _facts(model: DejaVu, sequence: SequenceModel | None, centre: bool, views: V
         facts["outputs"] = {"scores": [1, places], "next_state": state}
         facts["first_state"] = "nan" if first.isnan().any() else "0"
         facts["sequence"] = str(sequence)
+        facts |= {"counted": sequence.counted} if sequence.counted else {}
         threshold = sequence.threshold_of(model.threshold)
         threshold = sequence.likely if threshold is None else threshold  # without a calibration
     shifts, penalties = views.known

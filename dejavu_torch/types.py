@@ -382,8 +382,8 @@ class SequenceModel(nn.Module, ABC):
         whole: whether it needs all queries, as of a drive.
         is_drive: whether the queries that it was fitted to, if any, are a drive of the map.
         length, speeds: queries that it sums over, and places that pass from one to the next, if it has these.
-        lag: queries by which its answers come later. Parameters and buffers need other names
-            than these six.
+        lag: queries by which its answers come later. counted: numbers at the front of a packed state that
+            count queries. Parameters and buffers need other names than these seven.
 
     Convention: each score is for the place of its own query. All but those of a `whole` drive are causal, and
         their memory does not grow with the queries. Matching changes none: what it has to know beside its
@@ -397,6 +397,7 @@ class SequenceModel(nn.Module, ABC):
     length: int = 1
     speeds: tuple[float, ...] = ()
     lag: int = 0
+    counted: int = 0
 
     @abstractmethod
     def start(self, places: int, fixed: bool = False) -> State:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 import shlex
 import sys
@@ -28,7 +29,7 @@ from dejavu_torch import (
     open_source,
 )
 from dejavu_torch import export as onnx_file
-from dejavu_torch.export import METADATA, OPSET, export_onnx, run_session, session_of
+from dejavu_torch.export import METADATA, OPSET, export_onnx, nearness_of, run_session, session_of
 from dejavu_torch.features.cnn import SmallCNN
 from dejavu_torch.features.distilled import Distilled
 from dejavu_torch.features.joined import Joined
@@ -263,8 +264,64 @@ def test_the_documentation_runs_and_a_filter_goes_from_state_to_state(tmp_path, 
             run(*shlex.split(line)[1:])
     found = re.findall(r"^(\d+) (?:True|False)$", capsys.readouterr().out, re.MULTILINE)
     assert [abs(int(place) - 40) <= 5 for place in found] == [True] * 4
-    route, model = DejaVu.load("road.safetensors").eval(), PlaceFilter()
-    queries = open_source("sim:aerial?frames=64&traverse=1")[30:42]
-    states = [1 + 64 * len(model.steady.change) * 2]  # both ways
+    route = DejaVu.load("road.safetensors").eval()
+    model = PlaceFilter().having(nearness=nearness_of(route.map))
+    queries = open_source("sim:aerial?frames=64&traverse=1")[30:60]
+    states = [128 + 1 + 64 * len(model.steady.change) * 2]  # both ways
     facts = assert_streams(Path("drive.onnx"), route, model, states, queries)
-    assert facts["threshold"] == model.likely
+    assert (facts["threshold"], facts["counted"], facts["first_state"]) == (model.likely, 128, "0")
+
+
+def walk(frames, seed):
+    """Descriptors that change slowly."""
+    steps = torch.randn(frames, 48, generator=torch.Generator().manual_seed(seed))
+    for t in range(1, frames):
+        steps[t] = 0.95 * steps[t - 1] + math.sqrt(1 - 0.95**2) * steps[t]
+    return steps
+
+
+def seen_again(rows, seed):
+    return rows + 0.3 * torch.randn(rows.shape, generator=torch.Generator().manual_seed(seed))
+
+
+def test_a_filter_in_a_file_learns_when_a_drive_has_left_the_map(tmp_path):
+    road = walk(300, 0)
+    model, given = DejaVu(whitening="none").learn(road).eval(), PlaceFilter()
+    queries = torch.cat([seen_again(road[20:120], 5), seen_again(walk(100, 7), 6)])  # then another road
+    facts = export_onnx(model, tmp_path / "map.onnx", given).facts
+    assert given.counted == 0  # the caller's is as it was
+    filter = given.having(nearness=nearness_of(model.map))
+    states = [facts["counted"] + 1 + 300 * len(given.steady.change) * 2]
+    assert_streams(tmp_path / "map.onnx", model, filter, states, queries)
+    with torch.no_grad():
+        (before,) = streamed(given, [model(queries)])
+    after = run_session(session_of(str(tmp_path / "map.onnx")), queries)
+    known, alone = ((-scores.amin(1)).exp() for scores in (after, before))
+    assert float((alone[110:] >= 0.5).double().mean()) > 0.5
+    assert float(known[110:].max()) < 0.1
+    assert float((known[:100] - alone[:100]).abs().max()) < 0.05
+    assert float((known[:100] >= 0.5).double().mean()) > 0.9
+    session, state = session_of(str(tmp_path / "map.onnx")), torch.zeros(states).numpy()
+    for query, count in ((queries[:1], 1), (queries[1:2], 2), (torch.zeros(1, 48), 2)):  # black: not counted
+        _, state = session.run(None, {"features": query.numpy(), "state": state})
+        assert state[: facts["counted"]].sum() == count
+        assert state[facts["counted"] :].sum() == pytest.approx(1, abs=1e-4)
+
+
+def test_what_has_no_say_about_being_off_the_map_has_a_state_as_before(tmp_path):
+    """A map of templates or of a low fidelity, a filter that learns, and a sequence."""
+    rough = DejaVu(mapper=SpectralMapper(1.0)).learn(torch.rand(90, 24)).eval()
+    assert rough.map.fidelity < 0.7
+    faithful = DejaVu(mapper=SpectralMapper(16.0)).learn(torch.rand(90, 8)).eval()
+    learning = PlaceFilter(learns=True)
+    for model, sequence in (
+        (of_features(), PlaceFilter()),
+        (rough, PlaceFilter()),
+        (faithful, learning),
+        (faithful, SequenceMatcher(5)),
+    ):
+        facts = export_onnx(model, tmp_path / "map.onnx", sequence).facts
+        assert "counted" not in facts
+        own = sequence.packed(sequence.start(model.map.places, fixed=True))
+        queries = torch.rand(30, model.frame_shape[0])
+        assert_streams(tmp_path / "map.onnx", model, sequence, [*own.shape], queries)

@@ -32,6 +32,9 @@ NEAREST = 0.1, 0.4  # quantiles of the best scores of queries, from which those 
 MOST_ABSENT, MOST_PRESENT = 5.0, 1.0  # nats that a query's best score tells of being off, and on, the map
 KNOWN = 20  # queries, and mirrored ones, from which on a filter knows it
 FILTERED = 2.0  # of a filter's queries say as much as one: 4 and 2 were compared on all routes of `ends`
+# Of an exported filter, which has no calibration beside it: bins of its histogram, and by how many scales
+# `off` has to lie beyond `on`: 0, .3, .5 and .75 were compared on eleven routes of `ends`
+BINS, STANDS_APART = 128, 0.5
 
 # The fit: priors, and what they count as; on recorded drives, later on `drives`.
 ROUNDS = 5  # of expectation-maximisation

@@ -10,7 +10,6 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
-from torch.distributions import Normal, StudentT
 
 from dejavu_torch.maps.compiling import floats_of
 from dejavu_torch.recognition import chosen, loops
@@ -19,6 +18,10 @@ from dejavu_torch.types import Traverse
 LOWEST, HIGHEST, PER_DEVIATION = -8, 40, 64  # standard deviations of a rank table, and entries for each
 MIN_SHARE = 1e-30  # of wrong scores, for a finite normal score
 COLUMNS = 256  # of descriptors that are transformed at a time
+LEAST_WIDE = 1e-3  # of `Presence`, as a share of `off`
+LOW, MIDDLE = torch.special.ndtri(torch.tensor(chosen.NEAREST)).tolist()  # standard deviations from the mean
+NORMALISER = math.lgamma((chosen.TAIL + 1) / 2) - math.lgamma(chosen.TAIL / 2)  # log, of Student's t
+NORMALISER -= math.log(chosen.TAIL * math.pi) / 2
 
 
 class Spacing(NamedTuple):
@@ -220,23 +223,24 @@ class Presence(NamedTuple):
 
     On the map, they are about `on`, by a scale of `wide`, with some that are hard to recognise (Student's t).
     Those that show nothing of it are about `off`, with a deviation of `spread`; those of ground that looks
-    like it, between `on` and `off`, the more often the farther.
+    like it, between `on` and `off`, the more often the farther. Each is one number, or one for each query.
     """
 
-    on: float
-    wide: float
-    off: float
-    spread: float
+    on: float | Tensor
+    wide: float | Tensor
+    off: float | Tensor
+    spread: float | Tensor
 
     def absent(self, best: Tensor) -> Tensor:
         """Log likelihood ratio of being off the map by the best scores (...) of queries. It is bounded, and
         says little of being on the map, as an image of other ground may come near, too."""
-        x = best.clamp(min=self.on, max=self.off)
-        own = StudentT(chosen.TAIL, self.on, self.wide, validate_args=False)  # a score may be NaN
-        null = Normal(self.off, self.spread, validate_args=False)
-        alike = 2 * (x - self.on) / (self.off - self.on) ** 2
-        off = (alike + null.log_prob(x).exp()) / 2
-        told: Tensor = off.clamp(min=MIN_SHARE).log() - own.log_prob(x)
+        on, wide, off, spread = (torch.as_tensor(one, dtype=best.dtype, device=best.device) for one in self)
+        x = torch.minimum(torch.maximum(best, on), off)
+        # written out, since torch.distributions cannot be exported
+        own = NORMALISER - wide.log() - (chosen.TAIL + 1) / 2 * (((x - on) / wide) ** 2 / chosen.TAIL).log1p()
+        null = (-(((x - off) / spread) ** 2) / 2).exp() / (spread * math.sqrt(2 * math.pi))
+        alike = 2 * (x - on) / (off - on) ** 2
+        told: Tensor = ((alike + null) / 2).clamp(min=MIN_SHARE).log() - own
         return told.clamp(-chosen.MOST_PRESENT, chosen.MOST_ABSENT).nan_to_num(0, 0, 0)
 
 
@@ -246,10 +250,9 @@ def presence_of(best: Tensor, null: Tensor) -> Presence | None:
     best, null = (one[one.isfinite()].float().cpu() for one in (best, null))
     if min(len(best), len(null)) < 2:
         return None
-    share = best.new_tensor(chosen.NEAREST)
-    (low, on), (low_normal, normal) = best.quantile(share).tolist(), torch.special.ndtri(share).tolist()
-    off, least = float(null.mean()), 1e-3 * float(null.abs().mean()) + MIN_SHARE
-    wide = max(least, (on - low) / (normal - low_normal))
+    low, on = best.quantile(best.new_tensor(chosen.NEAREST)).tolist()
+    off, least = float(null.mean()), LEAST_WIDE * float(null.abs().mean()) + MIN_SHARE
+    wide = max(least, (on - low) / (MIDDLE - LOW))
     return Presence(on, wide, off, max(least, float(null.std()))) if on < off else None
 
 

@@ -18,7 +18,7 @@ from dejavu_torch.places.states import States
 from dejavu_torch.recognition import chosen, odometry
 from dejavu_torch.recognition.engine import MIN_PROBABILITY, Motion, Rates
 from dejavu_torch.recognition.motion import AlongRoute, checked_rates, logits
-from dejavu_torch.recognition.online import Learned
+from dejavu_torch.recognition.online import UNKNOWN, Learned, Nearness
 from dejavu_torch.recognition.plane import SHARP, Followed, PlaneMotion
 from dejavu_torch.recognition.sequence import each
 from dejavu_torch.recognition.speeds import FREE, steady
@@ -61,6 +61,7 @@ class FilterState(NamedTuple):
         left_out: after each of these, how many queries were left out. told: (R,2), how much speaks for being
             off the map, and places moved, NaN where unknown; see `PlaceFilter.step`.
         ahead: (), of a place, by which the camera is ahead of whole places moved.
+        counts: (bins,), best scores so far, see `Nearness`.
     """
 
     belief: Tensor
@@ -70,13 +71,15 @@ class FilterState(NamedTuple):
     left_out: tuple[int, ...]
     told: Tensor
     ahead: Tensor
+    counts: Tensor
 
     def to(self, like: Tensor) -> FilterState:
         """The same, of the type and on the device of a tensor."""
         learned = self.learned and type(self.learned)(*(one.to(like) for one in self.learned))
         rows = self.belief, self.posterior, self.waiting, self.told
         belief, posterior, waiting, told = (one.to(like) for one in rows)
-        return FilterState(belief, posterior, learned, waiting, self.left_out, told, self.ahead)
+        counts = self.counts.to(like.device)  # which half precision cannot count
+        return FilterState(belief, posterior, learned, waiting, self.left_out, told, self.ahead, counts)
 
 
 class PlaceFilter(SequenceModel):
@@ -164,6 +167,7 @@ class PlaceFilter(SequenceModel):
         self.within, self.threshold, self.lag, self.learns = within, threshold, lag, learns
         self.turn, self.back, self.steady = turn, back, steady(speeds, chosen.KEEPS_LIVE, chosen.USUAL)
         self.layout = ROUTE  # of the places, see `over`
+        self.nearness = UNKNOWN  # of queries to the map: in exported files
 
     def over(self, layout: Layout) -> Self:
         """A copy for places that lie so; moves and sharpness for an area replace those for a route by
@@ -182,7 +186,7 @@ class PlaceFilter(SequenceModel):
         kind, moves, states = self._learned, len(self.move_logits), self._states(places)
         learned = None if kind is None else kind.unpacked(new(kind.size(places, moves)), places, moves)
         none = new(0, places), (), new(0, 2), torch.zeros((), dtype=torch.float64)
-        return FilterState(new(states), new(places + 1), learned, *none)
+        return FilterState(new(states), new(places + 1), learned, *none, new(self.counted))
 
     @property
     def _ways(self) -> int:
@@ -199,20 +203,21 @@ class PlaceFilter(SequenceModel):
         return 1 + {1: self._ways * places, 2: layout.rows * layout.columns}[layout.dimensions]
 
     def packed(self, state: FilterState) -> Tensor:
-        """The state of a filter without a lag: its belief (S,), or, if it learns, that and what is learned
-        in rows (R,S)."""
+        """The state of a filter without a lag: `counted` numbers and its belief, (C+S,), or, if it learns,
+        its belief and what is learned in rows (R,S)."""
         if state.learned is None:
-            return state.belief
+            return torch.cat([state.counts, state.belief])
         numbers = torch.cat([state.belief, *state.learned])
         return F.pad(numbers, (0, -len(numbers) % len(state.belief))).view(-1, len(state.belief))
 
     def unpacked(self, state: Tensor) -> FilterState:
         """The state that was packed."""
+        counts, state = state[..., : self.counted].flatten(), state[..., self.counted :]
         places, rows = self._places(state.shape[-1]), state.reshape(-1, state.shape[-1])
         kind, learned = self._learned, rows[1:].flatten()
         known = None if kind is None else kind.unpacked(learned, places, len(self.move_logits))
         none = state.new_zeros(0, places), (), state.new_zeros(0, 2), state.new_zeros(())
-        return FilterState(rows[0], state.new_zeros(places + 1), known, *none)
+        return FilterState(rows[0], state.new_zeros(places + 1), known, *none, counts)
 
     def forward(self, scores: Tensor, before: Tensor | None = None) -> Tensor:
         if scores.ndim > 2:
@@ -290,6 +295,15 @@ class PlaceFilter(SequenceModel):
         """The kind of what is learned on the way."""
         return {1: Learned if self.learns else None, 2: Followed}[self.layout.dimensions]
 
+    @property
+    def _nearness(self) -> Nearness:
+        """How near queries come to the map; a filter that learns finds in another way what is off it."""
+        return self.nearness if self._learned is None else UNKNOWN
+
+    @property
+    def counted(self) -> int:  # type: ignore[override]
+        return self._nearness.bins
+
     @without_autocast
     def _answers(
         self,
@@ -313,16 +327,18 @@ class PlaceFilter(SequenceModel):
             shapes = f"the posterior is {tuple(state.posterior.shape)}, of {len(state.belief)} states"
             own = f"({places + 1},), and {self._states(places)} states, for this map and filter"
             raise InputError(f"{shapes}; expected {own}")
-        belief, posterior, learned, waiting, left, known, camera = state.to(scores)
+        belief, posterior, learned, waiting, left, known, camera, counts = state.to(scores)
         unknown = scores.new_tensor([0.0, math.nan]).expand(len(scores), 2)
         odometry_known = told is not None or len(known) > 0
-        told = torch.cat([known, unknown if told is None else told.to(scores)])
+        left_out, new = (*left, *[0] * len(scores)), scores
+        scores = torch.cat([waiting, scores]) if len(waiting) else scores
+        moments, motion = moments_of(scores), self.motion(scores, route_starts, learned)
+        nats, counts = self._nearness.after(new, moments.varied[len(waiting) :, 0], counts)
+        told = (unknown if told is None else told.to(scores)) + F.pad(nats[:, None], (0, 1))
+        told = torch.cat([known, told])
         absent = told[:, 0]
         if odometry_known and len(told) and not bool(belief.any()):
             told[0, 1] = math.nan  # there is no query before the first
-        left_out = (*left, *[0] * len(scores))
-        scores = torch.cat([waiting, scores]) if len(waiting) else scores
-        moments, motion = moments_of(scores), self.motion(scores, route_starts, learned)
         likelihoods = scores if learned else self.likelihoods(scores, moments, None, absent)  # else in turn
         posteriors, due = [], len(scores) if last else max(0, len(scores) - self.lag)
         by_odometry = self._by_odometry(motion, told[:, 1], camera) if odometry_known else None
@@ -353,7 +369,8 @@ class PlaceFilter(SequenceModel):
         answers = torch.stack(posteriors) if posteriors else scores.new_zeros(0, places + 1)
         latest = answers[-1] if posteriors else posterior
         camera = camera if by_odometry is None else by_odometry[1][due]
-        after = FilterState(belief, latest, learned, scores[due:], left_out[due:], told[due:], camera)
+        waits = scores[due:], left_out[due:], told[due:]
+        after = FilterState(belief, latest, learned, *waits, camera, counts)
         return answers, scores[:due], after
 
     @staticmethod

@@ -1249,6 +1249,27 @@ MUTANTS = [
         ("tests/recognition/test_speeds.py", "tests/recognition/test_filter.py::-k literal"),
     ),
     Mutant(
+        "A filter in a file says nothing of being off a map that is not told from other ground.",
+        "dejavu_torch/recognition/online.py",
+        "& (self.off - on >= chosen.STANDS_APART * wide)",
+        "& (self.off - on >= 0)",
+        ("tests/recognition/test_online.py",),
+    ),
+    Mutant(
+        "Queries that show nothing are not counted by a filter in a file.",
+        "dejavu_torch/recognition/online.py",
+        "((at[:, None] == bins) & speaks[:, None])",
+        "(at[:, None] == bins)",
+        ("tests/recognition/test_online.py",),
+    ),
+    Mutant(
+        "A filter in a file learns how near mirrored places of the map come.",
+        "dejavu_torch/export.py",
+        "sequence = sequence.having(nearness=nearness_of(model.map))",
+        "sequence = sequence.having(nearness=UNKNOWN)",
+        ("tests/test_onnx_export.py::-k left_the_map",),
+    ),
+    Mutant(
         "What odometry tells is known of the query that it is told of.",
         "dejavu_torch/recognition/odometry.py",
         "at = places.clamp(min=1).cumsum(0) - 1",

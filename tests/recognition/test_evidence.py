@@ -10,7 +10,9 @@ import torch.nn.functional as F
 from hypothesis import given
 from hypothesis import strategies as st
 
+from dejavu_torch.recognition import chosen
 from dejavu_torch.recognition.evidence import (
+    Presence,
     RankTable,
     correlation_time,
     place_means,
@@ -110,6 +112,25 @@ def test_presence_is_that_of_its_densities(seed, scale):
         assert value == pytest.approx(min(5, max(-1, math.log(max(off, 1e-30) / on))), abs=1e-3)
     assert (told[1:] >= told[:-1] - 1e-4).all()
     assert found.absent(torch.tensor([math.nan])) == 0
+
+
+@given(st.integers(0, 99), st.sampled_from([torch.float32, torch.float64]))
+def test_presence_is_written_out_as_torchs_distributions(seed, dtype):
+    draw = torch.Generator().manual_seed(seed)
+    on, wide, apart, spread = (torch.rand(4, generator=draw) + 0.05).tolist()
+    off = on + apart
+    best = torch.linspace(on - 0.2, off + 0.2, 50, dtype=dtype)
+    x = best.clamp(on, off)
+    null = torch.distributions.Normal(off, spread).log_prob(x).exp()
+    odds = (2 * (x - on) / (off - on) ** 2 + null) / 2
+    expected = odds.clamp(min=1e-30).log() - torch.distributions.StudentT(chosen.TAIL, on, wide).log_prob(x)
+    told = Presence(on, wide, off, spread).absent(best)
+    assert told.dtype == dtype
+    torch.testing.assert_close(
+        told, expected.clamp(-chosen.MOST_PRESENT, chosen.MOST_ABSENT), rtol=0, atol=2e-5
+    )
+    each = Presence(torch.full((50,), on, dtype=dtype), torch.full((50,), wide, dtype=dtype), off, spread)
+    torch.testing.assert_close(each.absent(best), told)
 
 
 @pytest.mark.parametrize(

@@ -19,7 +19,7 @@ from dejavu_torch.recognition.calibration import Platt, Track
 from dejavu_torch.recognition.engine import sweep
 from dejavu_torch.recognition.filter import moments_of, near_scores
 from dejavu_torch.recognition.localizer import Localizer, Matching
-from dejavu_torch.recognition.online import Learned
+from dejavu_torch.recognition.online import Learned, Nearness
 from dejavu_torch.types import Match, SequenceModel
 
 
@@ -356,6 +356,7 @@ MODELS = {
     "backwards": SequenceMatcher(7, (-1, 0)),
     "filter": PlaceFilter(),
     "learning filter": PlaceFilter(learns=True),
+    "filter with a nearness": PlaceFilter().having(nearness=Nearness(0.2, 0.1, 64)),
     "filter alone": PlaceFilter(within=0, moves=(0.5, 0.0, 0.25, 0.25), jump=0.05, off_map=2.0),
 }
 
