@@ -204,10 +204,10 @@ class Coordinates(NamedTuple):
     frame: str = ""
     height: int = 2
 
-    def flat(self) -> Coordinates:
-        """Without heights."""
+    def upright(self) -> Tensor:
+        """The values with the height last, of three."""
         ground = [column for column in range(3) if column != self.height]
-        return self if self.values.shape[1] < 3 else self._replace(values=self.values[:, ground], height=2)
+        return self.values if self.values.shape[1] < 3 else self.values[:, [*ground, self.height]]
 
 
 @dataclass(frozen=True)
