@@ -39,7 +39,7 @@ class Part(Traverse):
         self.traverse, self.frame, self.name = traverse, frame, traverse.name
         self.sized, self.ordered = traverse.sized, traverse.ordered
         if isinstance(frame, range):
-            self.beyond = (len(traverse) + traverse.beyond - frame.stop) // frame.step
+            self.beyond = len(range(frame.start, len(traverse) + traverse.beyond, frame.step)) - len(frame)
         self.times, self.places, self.headings = (
             None if values is None else values[torch.as_tensor(frame)]
             for values in (traverse.times, traverse.places, traverse.headings)
