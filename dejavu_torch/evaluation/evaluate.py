@@ -29,7 +29,7 @@ from dejavu_torch.data.ground_truth import (
 )
 from dejavu_torch.evaluation import curves
 from dejavu_torch.evaluation.agreement import Judged
-from dejavu_torch.evaluation.answers import MIN_WIDTH, answer_facts, shift_facts
+from dejavu_torch.evaluation.answers import answer_facts, shift_facts
 from dejavu_torch.evaluation.contenders import contend
 from dejavu_torch.evaluation.doubts import compared, doubt_facts, ground_of
 from dejavu_torch.evaluation.match_plots import draw_coverage
@@ -177,7 +177,7 @@ def evaluate_file(
         ground = ground_of(truth, reference, query, found, queries)
         facts |= {} if ground is None else shift_facts(ground.near, here, ground.found, ground.asked)
         judged, right = scored_and_right(match.index, known, tolerance)
-        one = Judged(found, queries, right, judged, max(tolerance, MIN_WIDTH), described, places)
+        one = Judged(found, queries, right, judged, tolerance, described, frames)
         facts |= doubt_facts(compared(one, ground, facts))
     accepted = facts["accepted"]
     facts["accepted_precision"] = facts["accepted_right"] / accepted if accepted else None
