@@ -70,6 +70,7 @@ class Traverse(Dataset[Tensor], ABC):
         sized: whether the user asked for their size, as with `width=` of a video.
         deep: whether its images have more than 8 bits a pixel.
         layout: where its frames lie, if they become the places of a map: along a route, or over an area.
+        maker: what made ready descriptors, as their file tells; "" if it does not.
         cut: of windows of one long image, its size, the window's, and their range; equal: the same places.
 
     Raises:
@@ -90,6 +91,7 @@ class Traverse(Dataset[Tensor], ABC):
     headings: Tensor | None = None
     ordered: bool = False
     sized: bool = False
+    maker: str = ""
     cut: tuple[tuple[int, ...], range] | None = None
     _layout: Layout = ROUTE
 

@@ -29,6 +29,7 @@ from dejavu_torch.model import DejaVu
 from dejavu_torch.motion.ground_plane import check_corners
 from dejavu_torch.motion.resampling import source_of
 from dejavu_torch.recognition.calibration import TOLERANCE
+from dejavu_torch.recognition.provenance import Heard
 from dejavu_torch.recognition.querying import Querying
 from dejavu_torch.recognition.select import Acceptance, check_candidates
 from dejavu_torch.recognition.smoother import PlaceSmoother
@@ -91,7 +92,8 @@ def run_localize(
         matcher = querying.matcher(SUPPRESSION, acceptance.threshold, ordered)
     assert not isinstance(matcher, str)
     asked = replace(querying.by(matcher), ordered=ordered)
-    matches, chosen = _found(model, query, asked)
+    heard = Heard()
+    matches, chosen = _found(model, query, asked, heard)
     counts, lost = Counter[str](), set[bool]()
 
     def counted() -> Iterator[Match]:
@@ -113,6 +115,8 @@ def run_localize(
         print(chosen)
     if querying.loops is None and any(lost):
         print(NO_DRIVE)
+    for doubt in model.provenance.doubts(model.map, heard.digests, query) if querying.loops is None else ():
+        say(str(doubt))
     if damaged:
         one, many = min(damaged), len(damaged)
         print(f"{many} frame{'s' * (many > 1)} could not be read, such as {one}: {damaged[one]}")
@@ -124,7 +128,9 @@ def run_localize(
     _print_evaluate(out, model, map, source if query.coordinates is not None else "SOURCE")
 
 
-def _found(model: DejaVu, query: Traverse, querying: Querying) -> tuple[Iterator[Match], Acceptance]:
+def _found(
+    model: DejaVu, query: Traverse, querying: Querying, heard: Heard
+) -> tuple[Iterator[Match], Acceptance]:
     """The matches of a query, of which candidates follow each other, and how they are accepted."""
     matcher, loops, top = querying.matcher(), querying.loops, querying.top
     assert not isinstance(matcher, str)
@@ -135,7 +141,7 @@ def _found(model: DejaVu, query: Traverse, querying: Querying) -> tuple[Iterator
         centre = smooths or matcher is None
         centre &= querying.centres(querying.ordered and model.centres(len(query)))
         querying = replace(querying, centre="mean" if centre else "none")
-    matches = model.matches(query, querying, True, apart=SUPPRESSION)
+    matches = model.matches(query, querying, True, apart=SUPPRESSION, heard=heard)
     return matches if top is None else (part.map(Tensor.flatten) for part in matches), acceptance
 
 

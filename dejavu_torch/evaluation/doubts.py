@@ -6,12 +6,17 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 from dejavu_torch.evaluation.localization import Localization
+from dejavu_torch.maps.digest import digests_of
 from dejavu_torch.types import Doubt, Facts
 
 
 def doubts_of(run: Localization) -> list[Doubt]:
     """What is doubtful about a run with its answers."""
-    return []
+    if run.querying.loops is not None:
+        return []
+    asked = run.query_features if run.causal_features is None else run.causal_features
+    digests = digests_of(asked[:: run.querying.copies], follow=False)
+    return run.model.provenance.doubts(run.model.map, digests, run.query)
 
 
 def doubt_facts(doubts: Iterable[Doubt]) -> Facts:
