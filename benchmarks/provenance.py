@@ -21,7 +21,7 @@ from dejavu_torch.features.hog import HOG
 from dejavu_torch.features.pixels import PatchPixels
 from dejavu_torch.maps.digest import digests_of
 from dejavu_torch.model import DejaVu
-from dejavu_torch.recognition.provenance import Spread, alike, correlated
+from dejavu_torch.recognition.provenance import Spread, alike
 from dejavu_torch.types import Traverse
 
 VISIT, FAST, PART = "second visit", "every third frame of it", "a third of it"
@@ -56,10 +56,8 @@ def run_provenance(data: Path, *, out: Path) -> list[str]:
     for i, (name, route) in enumerate(tqdm(PAIRS.items(), "provenance", disable=None, leave=False)):
         rows += [row | {"chosen": i % 2 == 0} for row in bench_route(name, route.below(data))]
         write_bench(out, rows)
-    lines = []
-    for chosen, what in ((True, "thresholds are chosen on"), (False, "and tested on")):
-        lines += [what, table([row for row in rows if row["chosen"] == chosen], COLUMNS)]
-    return lines
+    parts = [[row for row in rows if row["chosen"] == chosen] for chosen in (True, False)]
+    return [*(table(part, COLUMNS) for part in parts), "thresholds were chosen on the first table"]
 
 
 def bench_route(name: str, route: Route) -> Iterator[Row]:
@@ -106,7 +104,7 @@ def spread(reference: Traverse, query: Traverse) -> Row:
     if one is None or other is None:
         return {}
     told = "unlike" if one.unlike(other) else ""
-    return {"steady": one.steady, "correlation": correlated(one, other), "told": told}
+    return {"steady": one.steady, "correlation": one.correlation(other), "told": told}
 
 
 def networks(traverse: Traverse) -> dict[str, ArrayTraverse]:

@@ -532,7 +532,8 @@ def _check_compatible(model: DejaVu, added: Traverse) -> None:
         raise InputError(f"{added.name} has {seen}, the map was learned from {learned}; expected the same")
     count, expected = model.descriptor.count_features(added), features_per_frame(model)
     expect(count == expected, f"{expected}, as in the map", f"{added.name} gives {count} features per frame")
-    model.provenance.check_spread(added)
+    told = 'or {"maker": ...} in the .json beside both, if one network made them'
+    expect(not (seen := model.provenance.unlike(added)), f"the map's, {told}", seen)
 
 
 def _compatible(model: DejaVu, stored: tuple[int, ...], shape: tuple[int, ...]) -> bool:

@@ -86,8 +86,8 @@ class ChunkEncoder:
                 shown = views_of(self.visits, torch.arange(frames.start, frames.stop))
                 rows = averaged(self.descriptor, rows, shown)
             columns = self.traverse.layout.columns_from(frames.start)
-            settings = self.mean, self.step, self.transform, self.resolution, columns
-            return encode_chunk(rows, *settings)._replace(digest=digest)
+            chunk = encode_chunk(rows, self.mean, self.step, self.transform, self.resolution, columns)
+            return chunk._replace(digest=digest)  # of the reference, not of means of visits
 
 
 class Checkpoint:

@@ -103,7 +103,7 @@ class ModelState:
     frame_names: list[str] = field(default_factory=list)
     calibration: Calibration | None = None
     views: Views | None = None
-    provenance: Provenance = Provenance()
+    provenance: Provenance = field(default_factory=Provenance)
 
 
 class Model(Protocol):

@@ -286,7 +286,7 @@ def run_info(map: Path, *, features: nn.Module | None = None, command: str) -> N
         made = model.provenance.maker or 'unknown; {"maker": ...} in the .json beside an .npy would tell'
         say(f"these descriptors were made by: {made}")
     if taught := model.provenance.taught:
-        say(f"taught by: {', '.join(dict.fromkeys(one.name for one in taught))}")
+        say(f"taught by: {', '.join(dict(taught))}")
     for part in parts:
         if part in parts[: 2 + len(made_by)] or part.extra_repr():
             print(f"{type(part).__name__}: {part.extra_repr()}")

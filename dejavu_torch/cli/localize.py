@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import threading
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 
+import torch
 from torch import Tensor
 
 from dejavu_torch.cli import options
@@ -25,11 +26,11 @@ from dejavu_torch.data.output import check_output_file
 from dejavu_torch.data.source import check_not_read, open_source
 from dejavu_torch.data.traverse import Whole
 from dejavu_torch.evaluation.answers import describe_probable, next_steps, probable_counts
+from dejavu_torch.maps.digest import BYTES, digests_of
 from dejavu_torch.model import DejaVu
 from dejavu_torch.motion.ground_plane import check_corners
 from dejavu_torch.motion.resampling import source_of
 from dejavu_torch.recognition.calibration import TOLERANCE
-from dejavu_torch.recognition.provenance import Heard
 from dejavu_torch.recognition.querying import Querying
 from dejavu_torch.recognition.select import Acceptance, check_candidates
 from dejavu_torch.recognition.smoother import PlaceSmoother
@@ -92,8 +93,8 @@ def run_localize(
         matcher = querying.matcher(SUPPRESSION, acceptance.threshold, ordered)
     assert not isinstance(matcher, str)
     asked = replace(querying.by(matcher), ordered=ordered)
-    heard = Heard()
-    matches, chosen = _found(model, query, asked, heard)
+    digests = [torch.zeros(0, BYTES, dtype=torch.uint8)]
+    matches, chosen = _found(model, query, asked, lambda rows: digests.append(digests_of(rows, follow=False)))
     counts, lost = Counter[str](), set[bool]()
 
     def counted() -> Iterator[Match]:
@@ -115,8 +116,9 @@ def run_localize(
         print(chosen)
     if querying.loops is None and any(lost):
         print(NO_DRIVE)
-    for doubt in model.provenance.doubts(model.map, heard.digests, query) if querying.loops is None else ():
-        say(str(doubt))
+    if querying.loops is None:
+        for doubt in model.provenance.doubts(model.map, torch.cat(digests), query):
+            say(str(doubt))
     if damaged:
         one, many = min(damaged), len(damaged)
         print(f"{many} frame{'s' * (many > 1)} could not be read, such as {one}: {damaged[one]}")
@@ -129,7 +131,7 @@ def run_localize(
 
 
 def _found(
-    model: DejaVu, query: Traverse, querying: Querying, heard: Heard
+    model: DejaVu, query: Traverse, querying: Querying, heard: Callable[[Tensor], object]
 ) -> tuple[Iterator[Match], Acceptance]:
     """The matches of a query, of which candidates follow each other, and how they are accepted."""
     matcher, loops, top = querying.matcher(), querying.loops, querying.top

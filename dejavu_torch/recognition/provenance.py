@@ -21,7 +21,6 @@ log = logging.getLogger("dejavu_torch")
 
 ASKED = 2**17  # queries that are looked at, the first ones
 ROWS = 256  # of ready descriptors whose mean is taken, at most
-LEVELS = 127  # of the numbers of a mean
 
 # Chosen on every other route of `benchmarks provenance`, which tells of the others.
 SAME, FEWEST_SAME = 0.15, 8  # share of the places, and places, at least, that a query equals
@@ -32,19 +31,16 @@ LARGER = 4.0  # ratio of the sizes of one network's, at most
 WIDE, FEWEST_SPREAD = 16, 50  # dimensions, and descriptors, of fewer of which nothing is told
 
 Relation = Literal["", "frames", "between"]
-OWN: dict[Relation, str] = {
-    "frames": "the queries are frames of the map itself",
-    "between": "the queries lie between the frames of the map, as those of the same drive",
+SEEN: dict[Relation, str] = {
+    "frames": "frames of the map itself",
+    "between": "frames between those of the map, as of the same drive",
 }
 SO = "another visit will be found less often"
 
 
 class Spread(NamedTuple):
-    """How ready descriptors are spread.
-
-    mean: of each dimension, about that of all, as whole numbers up to 127. size: root mean square of all
-    numbers. steady: the least correlation of the mean of a quarter of them with that of the others.
-    """
+    """Ready descriptors: mean of each dimension about that of all, as int8 up to 127; root mean square of all
+    numbers; and the least correlation of the mean of a quarter of them with that of the others."""
 
     mean: bytes
     size: float
@@ -59,44 +55,29 @@ class Spread(NamedTuple):
         rows = rows[rows.any(1)]
         if len(rows) < FEWEST_SPREAD or not rows.square().mean().isfinite():
             return None
-        mean, quarters = rows.mean(0), rows.tensor_split(4)
-        others = [(mean * len(rows) - one.sum(0)) / (len(rows) - len(one)) for one in quarters]
-        pairs = zip(quarters, others, strict=True)
-        steady = min(correlation(one.mean(0), other) for one, other in pairs)
-        about = mean - mean.mean()
-        levels = (about * (LEVELS / about.abs().max().clamp(min=1e-30))).round().to(torch.int8)
-        return cls(levels.numpy().tobytes(), float(rows.square().mean().sqrt()), steady)
+        total = rows.sum(0)
+        sums = [(part.sum(0), total - part.sum(0)) for part in rows.tensor_split(4)]
+        about = total - total.mean()
+        mean = (about * (127 / about.abs().max().clamp(min=1e-30))).round().to(torch.int8)
+        size = float(rows.square().mean().sqrt())
+        return cls(mean.numpy().tobytes(), size, min(correlation(*pair) for pair in sums))
+
+    def correlation(self, other: Spread) -> float:
+        """That of the means of two drives."""
+        means = (torch.tensor([*one.mean]).to(torch.uint8).view(torch.int8).float() for one in (self, other))
+        return correlation(*means)
 
     def unlike(self, other: Spread) -> bool:
         """Whether descriptors of the other seem to be made by something else."""
-        if len(other.mean) != len(self.mean):
-            return False
-        far = abs(math.log(max(other.size, 1e-30) / max(self.size, 1e-30))) > math.log(LARGER)
-        return far or (self.steady >= STEADY and correlated(self, other) < CORRELATED)
-
-
-def correlated(one: Spread, other: Spread) -> float:
-    """The correlation of the means of two drives."""
-    means = (torch.tensor([*each.mean], dtype=torch.uint8).view(torch.int8).float() for each in (one, other))
-    return correlation(*means)
+        ratio = max(other.size, 1e-30) / max(self.size, 1e-30)
+        far = abs(math.log(ratio)) > math.log(LARGER)
+        alike = len(other.mean) != len(self.mean)  # which is refused elsewhere
+        return not alike and (far or (self.steady >= STEADY and self.correlation(other) < CORRELATED))
 
 
 def correlation(one: Tensor, other: Tensor) -> float:
     """Of two vectors; 0 if one of them is constant."""
-    one, other = one - one.mean(), other - other.mean()
-    return float(torch.nn.functional.cosine_similarity(one, other, 0))
-
-
-class Taught(NamedTuple):
-    """A traverse that taught a map: its name, and digests of some of its frames."""
-
-    name: str
-    digests: bytes
-
-    @property
-    def known(self) -> Tensor:
-        """The digests, (n,9)."""
-        return torch.tensor([*self.digests], dtype=torch.uint8).view(-1, BYTES)
+    return float(torch.nn.functional.cosine_similarity(one - one.mean(), other - other.mean(), 0))
 
 
 @dataclass(frozen=True)
@@ -105,13 +86,13 @@ class Provenance:
 
     Attributes:
         maker: of ready descriptors, as their files tell; "" if they do not. spread: of these.
-        taught: the traverses that taught it beside its own: further visits, drives, and those it was
-            calibrated by.
+        taught: names of the traverses that taught it beside its own (further visits, drives, those it was
+            calibrated by), and digests of some of their frames.
     """
 
     maker: str = ""
     spread: Spread | None = None
-    taught: tuple[Taught, ...] = ()
+    taught: tuple[tuple[str, bytes], ...] = ()
 
     @classmethod
     def of(cls, traverse: Traverse) -> Provenance:
@@ -121,68 +102,41 @@ class Provenance:
     @classmethod
     def merged(cls, parts: Sequence[Provenance]) -> Provenance:
         """That of a map of several."""
-        taught = dict.fromkeys(one for part in parts for one in part.taught)
-        return replace(parts[0], taught=tuple(taught))
+        return replace(parts[0], taught=tuple(dict.fromkeys(one for part in parts for one in part.taught)))
 
     def taught_by(self, name: str, digests: Tensor) -> Provenance:
         """The same of a map that a traverse has taught, too."""
-        one = Taught(name, digests.numpy().tobytes())
-        return replace(self, taught=tuple(dict.fromkeys((*self.taught, one))))
+        return self.merged([self, Provenance(taught=((name, digests.numpy().tobytes()),))])
 
     def stored(self) -> Facts:
         """As JSON values, without what is not known."""
-        facts: Facts = {"maker": self.maker} if self.maker else {}
-        if self.spread is not None:
-            facts["spread"] = [b64encode(self.spread.mean).decode(), *self.spread[1:]]
-        taught = [[one.name, b64encode(one.digests).decode()] for one in self.taught]
-        return facts | ({"taught": taught} if taught else {})
+        spread = self.spread and [b64encode(self.spread.mean).decode(), *self.spread[1:]]
+        taught = [[name, b64encode(digests).decode()] for name, digests in self.taught]
+        facts = {"maker": self.maker, "spread": spread, "taught": taught}
+        return {name: value for name, value in facts.items() if value}
 
     @classmethod
     def restored(cls, facts: Facts) -> Provenance:
         """From the result of `stored`."""
-        spread, taught = facts.get("spread"), facts.get("taught", ())
-        known = spread and Spread(b64decode(spread[0]), *map(float, spread[1:]))
-        each = tuple(Taught(name, b64decode(digests)) for name, digests in taught)
-        return cls(facts.get("maker", ""), known, each)
+        spread = (known := facts.get("spread")) and Spread(b64decode(known[0]), *map(float, known[1:]))
+        taught = tuple((name, b64decode(digests)) for name, digests in facts.get("taught", ()))
+        return cls(facts.get("maker", ""), spread, taught)
 
-    def check_spread(self, added: Traverse) -> None:
-        """Refuse ready descriptors that seem to be made by something else, unless their files name them."""
-        if self._unlike(added):
-            expected = 'a {"maker": ...} in the .json beside the .npy of both, if one network made them'
-            raise InputError(f"{unlike(added)}; expected others, or {expected}")
-
-    def _unlike(self, queries: Traverse) -> bool:
-        named, own = self.maker and queries.maker, None if self.spread is None else Spread.of(queries)
-        return not named and self.spread is not None and own is not None and self.spread.unlike(own)
+    def unlike(self, queries: Traverse) -> str:
+        """What is said of ready descriptors that seem to be made by something else; "" of others."""
+        if self.spread is None or (self.maker and queries.maker) or (own := Spread.of(queries)) is None:
+            return ""
+        line = f"the descriptors of {queries.name} differ from the map's as those of another network do"
+        return line if self.spread.unlike(own) else ""
 
     def doubts(self, place_map: PlaceMap, digests: Tensor, queries: Traverse) -> list[Doubt]:
-        """Why answers to queries may mislead, of which there are digests."""
-        lines = [unlike(queries)] if self._unlike(queries) else []
-        if found := relation(place_map.digest, digests):
-            lines.append(f"{OWN[found]}: {SO}")
-        elif names := [one.name for one in self.taught if relation(one.known, digests)]:
-            lines.append(f"the queries taught this map ({', '.join(names)}): {SO}")
-        return [Doubt("provenance", line) for line in lines]
-
-
-def unlike(queries: Traverse) -> str:
-    """What is said of ready descriptors that seem to be made by something else."""
-    return f"the descriptors of {queries.name} differ from the map's as those of another network do"
-
-
-class Heard:
-    """The digests of queries, batch by batch."""
-
-    def __init__(self) -> None:
-        self.parts = [torch.zeros(0, BYTES, dtype=torch.uint8)]
-
-    def __call__(self, descriptors: Tensor) -> None:
-        self.parts.append(digests_of(descriptors, follow=False))
-
-    @property
-    def digests(self) -> Tensor:
-        """(Q,9)."""
-        return torch.cat(self.parts)
+        """Why answers to queries may mislead, of which there are digests (Q,9)."""
+        lines, found = [self.unlike(queries)], alike(place_map.digest, digests).relation
+        known = [(name, torch.tensor([*own], dtype=torch.uint8).view(-1, BYTES)) for name, own in self.taught]
+        names = [name for name, own in known if not found and alike(own, digests).relation]
+        lines += [f"the queries are {SEEN[found]}: {SO}"] if found else []
+        lines += [f"the queries taught this map ({', '.join(names)}): {SO}"] if names else []
+        return [Doubt("provenance", line) for line in lines if line]
 
 
 class Alike(NamedTuple):
@@ -213,15 +167,15 @@ def alike(known: Tensor, asked: Tensor) -> Alike:
     Args:
         known: (n,9) digests of the places. asked: (Q,9) of the queries, in order if they are.
     """
-    known, asked = (one.cpu()[(one.cpu()[:, :-1] > 0).any(1)] for one in (known, asked[:ASKED]))
+    known, asked = (one[(one[:, :-1] > 0).any(1)] for one in (known.cpu(), asked[:ASKED].cpu()))
     if min(len(known), len(asked)) < FEWEST_SAME:
         return Alike()
     places, queries = signs_of(known), signs_of(asked)
-    apart = _apart(places, queries)
+    apart = (BITS - places @ queries.T) / 2
     nearest, at = apart.min(1)
     pairs = nearest == apart.amin(0)[at]
     places, nearest, at = places[pairs], nearest[pairs], at[pairs]
-    others = _apart(queries[at], queries).scatter_(1, at[:, None], BITS).amin(1)
+    others = ((BITS - queries[at] @ queries.T) / 2).scatter_(1, at[:, None], BITS).amin(1)
     changed = torch.minimum(others, known[pairs, -1].float())
     differs = queries[at] != places
     beside = [queries[(at + step).clamp(0, len(queries) - 1)] != places for step in (-1, 1)]
@@ -230,25 +184,12 @@ def alike(known: Tensor, asked: Tensor) -> Alike:
     return Alike(len(places), same, float(beyond.sum()) / max(float(changed.sum()), 1e-9))
 
 
-def relation(known: Tensor, asked: Tensor) -> Relation:
-    """See `Alike`."""
-    return alike(known, asked).relation
-
-
-def _apart(one: Tensor, other: Tensor) -> Tensor:
-    """In how many signs each of one differs from each of the other: (n,64), (m,64) -> (n,m)."""
-    return (BITS - one @ other.T) / 2
-
-
 def check_independent(place_map: PlaceMap, visit: Traverse, descriptors: Tensor) -> None:
     """Refuse to calibrate a map by its own drive; of ready descriptors between its frames only warn, since
     those of another visit with little noise look alike."""
-    found = relation(place_map.digest, digests_of(descriptors, follow=False))
-    seen = {
-        "frames": "has frames of the map",
-        "between": "lies between the frames of the map, as the same drive",
-    }
+    found = alike(place_map.digest, digests_of(descriptors, follow=False)).relation
+    line = f"calibrating by {visit.name}: it has {SEEN[found]}" if found else ""
     if found == "frames" or (found and len(visit.frame_shape) == 3):
-        raise InputError(f"calibrating by {visit.name}: it {seen[found]}; expected another visit")
+        raise InputError(f"{line}; expected another visit")
     if found:
-        log.warning("calibrating by %s: it %s; probabilities may be too high", visit.name, seen[found])
+        log.warning("%s; probabilities may be too high", line)

@@ -20,7 +20,7 @@ from dejavu_torch.growth import append, average, learn_mean, merge, only_route
 from dejavu_torch.maps.digest import BYTES, PLACES, Digest, digests_of, signs_of
 from dejavu_torch.maps.file import read_map
 from dejavu_torch.model_file import state_from_json, state_to_json
-from dejavu_torch.recognition.provenance import Alike, Heard, Provenance, Spread, alike, relation
+from dejavu_torch.recognition.provenance import Alike, Provenance, Spread, alike
 from dejavu_torch.recognition.querying import Querying
 from dejavu_torch.teaching import refine
 from dejavu_torch.updating import update
@@ -47,6 +47,21 @@ def again(rows, seed=1, light=0.5, noise=0.05):
 
 def learned(rows, **settings):
     return DejaVu(whitening="none", mapper=SpectralMapper(**settings)).learn(rows)
+
+
+def relation(known, asked):
+    return alike(known, asked).relation
+
+
+class Heard(list):
+    """The digests of queries, batch by batch."""
+
+    def __call__(self, rows):
+        self.append(digests_of(rows, follow=False))
+
+    @property
+    def digests(self):
+        return torch.cat([*self])
 
 
 def told(model, queries):
@@ -247,7 +262,7 @@ def test_a_drive_that_refined_a_map_is_told(teach):
     assert told(model, changed) == ""
     assert teach(model, ArrayTraverse(changed, "monday")).changed
     assert "(monday)" in told(model, changed)
-    assert [one.name for one in model.provenance.taught] == ["monday"]
+    assert [name for name, _ in model.provenance.taught] == ["monday"]
 
 
 def test_images_that_taught_the_whitening_are_told():
@@ -279,7 +294,7 @@ def test_a_map_is_not_calibrated_by_its_own_drive(caplog):
     with caplog.at_level(logging.WARNING):
         model.calibrate(None, LabelledFrames(ArrayTraverse(rows[1::2], "odd"), at[:200]))
     assert "odd" in caplog.text
-    assert "between the frames of the map" in caplog.text  # as noise would look
+    assert "frames between those of the map" in caplog.text  # as noise would look
     frames = torch.nn.functional.interpolate(
         torch.rand(60, 1, 8, 8, generator=torch.Generator().manual_seed(0)).repeat_interleave(3, 0), (32, 32)
     )
@@ -289,7 +304,7 @@ def test_a_map_is_not_calibrated_by_its_own_drive(caplog):
     images.calibrate(frames[::2])  # by altered copies
     assert images.calibration is not None
     count = len(frames[1::2])
-    with refused("calibrating by odd: it lies between the frames of the map"):
+    with refused("calibrating by odd: it has frames between those of the map"):
         images.calibrate(None, LabelledFrames(ArrayTraverse(frames[1::2], "odd"), torch.arange(count)))
 
 
@@ -419,18 +434,23 @@ def test_commands_say_it_once(tmp_path, capsys):
         (path, own, ("--match", "single"), SAYS),
         (path, own, ("--match", "filter"), SAYS),
         (path, f"{own}?start=200", ("--top", "3"), SAYS),
-        (tmp_path / "even.safetensors", odd, ("--ordered",), "lie between the frames of the map"),
+        (
+            tmp_path / "even.safetensors",
+            odd,
+            ("--ordered",),
+            "the queries are frames between those of the map",
+        ),
         (path, b, ("--ordered",), ""),
         (path, a, ("--loops", "30"), ""),
     ):
         run("localize", map, source, "--out", csv, *words)
         said = capsys.readouterr().out
-        assert said.count("frames of the map") == bool(line)
+        assert said.count("the queries are frames") == bool(line)
         assert line in said
         if not words or words[0] == "--ordered":
             run("evaluate", csv, "--truth", "0", "--map", map, "--query", source, "--out", out)
             said = capsys.readouterr().out
-            assert said.count("frames of the map") == bool(line)
+            assert said.count("the queries are frames") == bool(line)
             assert line in said
             doubts = json.loads((out / "report.json").read_text())["doubts"]
             assert [doubt["kind"] for doubt in doubts] == ["provenance"] * bool(line)
