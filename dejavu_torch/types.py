@@ -71,6 +71,7 @@ class Traverse(Dataset[Tensor], ABC):
         deep: whether its images have more than 8 bits a pixel.
         layout: where its frames lie, if they become the places of a map: along a route, or over an area.
         beyond: frames that `stop=` left out after the last.
+        maker: what made ready descriptors, as their file tells; "" if it does not.
         cut: of windows of one long image, its size, the window's, and their range; equal: the same places.
 
     Raises:
@@ -92,6 +93,7 @@ class Traverse(Dataset[Tensor], ABC):
     ordered: bool = False
     sized: bool = False
     beyond: int = 0
+    maker: str = ""
     cut: tuple[tuple[int, ...], range] | None = None
     _layout: Layout = ROUTE
 

@@ -12,6 +12,7 @@ from dejavu_torch.data.ground_truth import Truth, check_ground_truth, scored_and
 from dejavu_torch.evaluation.agreement import Ground, Judged, coarse, contradictions
 from dejavu_torch.evaluation.answers import describe_line
 from dejavu_torch.evaluation.localization import Localization
+from dejavu_torch.maps.digest import digests_of
 from dejavu_torch.motion.resampling import source_of
 from dejavu_torch.types import Doubt, Facts, Match, Traverse
 
@@ -20,7 +21,16 @@ CONTRADICT = "the answers contradict the truth"
 
 def doubts_of(run: Localization, truth: Truth | None, facts: Mapping[str, Any]) -> list[Doubt]:
     """What is doubtful about a run with its answers, of which `facts` tell a line or shift."""
-    if run.truth is None or run.querying.loops is not None:
+    if run.querying.loops is not None:
+        return []
+    asked = run.query_features if run.causal_features is None else run.causal_features
+    digests = digests_of(asked[:: run.querying.copies], follow=False)
+    return _judged(run, truth, facts) + run.model.provenance.doubts(run.model.map, digests, run.query)
+
+
+def _judged(run: Localization, truth: Truth | None, facts: Mapping[str, Any]) -> list[Doubt]:
+    """What makes its answers agree with the truth."""
+    if run.truth is None:
         return []
     place_map = run.model.map
     match, alone = (one.renumbered(place_map.frame_of) for one in (run.match, run.judged))

@@ -281,7 +281,8 @@ def test_a_report_tells_it_first(tmp_path, capsys):
     rows = torch.nn.functional.normalize(
         torch.randn(300, 16, generator=torch.Generator().manual_seed(0)), dim=1
     )
-    reference, query = ArrayTraverse(rows, "a"), ArrayTraverse(rows.clone(), "b")
+    other = 0.15 * torch.randn(300, 16, generator=torch.Generator().manual_seed(1))
+    reference, query = ArrayTraverse(rows, "a"), ArrayTraverse(rows + other, "b")
     reference.coordinates, query.coordinates = Coordinates(PATH), Coordinates((PATH - PATH[50]) @ TURN.T)
     found = compare(reference, query, "metres:25", tolerance=5)
     (doubt,) = found.report.facts["doubts"]

@@ -6,6 +6,27 @@ from .mutant import Mutant
 
 MUTANTS = [
     Mutant(
+        "A frame is between two queries if it differs from both in few signs, not from one of them.",
+        "dejavu_torch/recognition/provenance.py",
+        "beyond = torch.stack([(differs & one).sum(1) for one in beside]).amin(0)",
+        "beyond = differs.sum(1)",
+        ("tests/recognition/test_provenance.py::-k dense",),
+    ),
+    Mutant(
+        "Equal pictures of a camera that stands tell nothing of where queries come from.",
+        "dejavu_torch/recognition/provenance.py",
+        "(nearest == 0) & (changed >= CHANGED)",
+        "(nearest == 0)",
+        ("tests/recognition/test_provenance.py::-k too_few",),
+    ),
+    Mutant(
+        "The digest of places that are means of visits is that of the reference alone.",
+        "dejavu_torch/learning.py",
+        "return chunk._replace(digest=digest)",
+        "return chunk",
+        ("tests/recognition/test_provenance.py::-k average_leave",),
+    ),
+    Mutant(
         "The frame of a reference video that the page asks for is decoded before all others.",
         "dejavu_torch/live/page.py",
         "at = max(0, asked - BEFORE // step * step)",
