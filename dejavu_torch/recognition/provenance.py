@@ -25,6 +25,7 @@ ROWS = 256  # of ready descriptors whose mean is taken, at most
 # Chosen on every other route of `benchmarks provenance`, which tells of the others.
 SAME, FEWEST_SAME = 0.15, 8  # share of the places, and places, at least, that a query equals
 CHANGED = 3  # signs that change to the next frame, at least, so that equal ones tell something
+SPARSE = 22  # signs that change to the next frame, where a frame between both would look like neither
 BETWEEN, FEWEST_BETWEEN = 0.31, 32  # signs beyond both queries, as a share of those that change; places
 CORRELATED, STEADY = 0.25, 0.3  # means of other networks at most, and of parts of one drive at least
 LARGER = 4.0  # ratio of the sizes of one network's, at most
@@ -181,7 +182,10 @@ def alike(known: Tensor, asked: Tensor) -> Alike:
     beside = [queries[(at + step).clamp(0, len(queries) - 1)] != places for step in (-1, 1)]
     beyond = torch.stack([(differs & one).sum(1) for one in beside]).amin(0)
     same = int(((nearest == 0) & (changed >= CHANGED)).sum())
-    return Alike(len(places), same, float(beyond.sum()) / max(float(changed.sum()), 1e-9))
+    dense = len(changed) > 0 and float(known[pairs, -1].float().median()) <= SPARSE
+    return Alike(
+        len(places), same, float(beyond.sum()) / max(float(changed.sum()), 1e-9) if dense else math.inf
+    )
 
 
 def check_independent(place_map: PlaceMap, visit: Traverse, descriptors: Tensor) -> None:
