@@ -417,7 +417,7 @@ def merge(models: Sequence[DejaVu], names: Sequence[str]) -> DejaVu:
     names = joined_names([model.frame_names for model in models], frames)
     looks = {one.views for one in models}
     views = ALONE if ALONE in looks else first.views if len(looks) == 1 else None
-    merged.state = ModelState(first.frame_shape, first.step, trained, names, views=views)
+    merged.state = ModelState(first.frame_shape, first.step, trained, names, None, views, first.probe)
     dropped = [
         *["thresholds"] * (len(thresholds) > 1),
         *["calibration"] * (calibration is None and any(model.calibration for model in models)),
