@@ -6,12 +6,21 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 from dejavu_torch.evaluation.localization import Localization
+from dejavu_torch.evaluation.second_look import is_doubtful, second_look
+from dejavu_torch.motion.resampling import source_of
+from dejavu_torch.recognition.select import PROBABLE
 from dejavu_torch.types import Doubt, Facts
 
 
 def doubts_of(run: Localization) -> list[Doubt]:
     """What is doubtful about a run with its answers."""
-    return []
+    match = run.match
+    if run.querying.loops is not None or match.probability is None:
+        return []
+    found = int((match.probability >= PROBABLE).sum())
+    ordered = run.way is not None or source_of(run.query).ordered
+    doubtful = is_doubtful(found, len(match), match.smoother)
+    return second_look(run.model, run.query, ordered) if doubtful else []
 
 
 def doubt_facts(doubts: Iterable[Doubt]) -> Facts:
