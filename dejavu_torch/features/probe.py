@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
+
 import torch
 from torch import Tensor
 
 from dejavu_torch.features.descriptor import Descriptor
 from dejavu_torch.features.extract import in_mode
-from dejavu_torch.memory import in_one_thread, without_autocast
+from dejavu_torch.memory import in_one_thread
+from dejavu_torch.types import InputError
 
 NUMBERS = 256  # of a descriptor that are kept, the first ones
 # relative to their length: the code of a default map is off by a fifth, so less changes hardly an answer, and
@@ -38,20 +41,20 @@ def probe_picture(shape: tuple[int, ...]) -> Tensor:
 
 
 @torch.no_grad()
-@without_autocast
 def probe_of(descriptor: Descriptor, shape: tuple[int, ...]) -> tuple[float, ...] | None:
-    """The first numbers of the descriptor of the picture; None of ready features, which have no picture."""
+    """The first numbers of the descriptor of the picture; None of ready features, which have no picture, and
+    of frames that others have described."""
     if len(shape) != 3 or (descriptor.whitening is not None and not descriptor.whitening.learned):
         return None
-    with in_one_thread(), in_mode(descriptor, False):
+    with suppress(InputError), in_one_thread(), in_mode(descriptor, False):
         rows = descriptor(probe_picture(shape).to(descriptor.device))
-    return tuple(rows[0, :NUMBERS].float().tolist())
+        return tuple(rows[0, :NUMBERS].float().tolist())
+    return None
 
 
 def probe_distance(descriptor: Descriptor, shape: tuple[int, ...], known: tuple[float, ...]) -> float:
     """How far the picture's descriptor now lies from a known one, relative to the length of that."""
-    before = torch.tensor(known)
-    now = torch.tensor(probe_of(descriptor, shape) or known)
+    before, now = torch.tensor(known), torch.tensor(probe_of(descriptor, shape) or ())
     if len(now) != len(before):
         return torch.inf
     return float((now - before).norm() / before.norm().clamp(min=1e-12))
