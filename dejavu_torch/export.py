@@ -15,12 +15,14 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, cast
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
 from dejavu_torch.data.output import check_output_file, whole_file
 from dejavu_torch.features.extract import in_mode, moved_features
 from dejavu_torch.features.preprocess import Preprocess
+from dejavu_torch.features.probe import probe_picture
 from dejavu_torch.maps.place_map import PlaceMap
 from dejavu_torch.maps.spectral_map import SpectralMap, scores_of
 from dejavu_torch.model import DejaVu, require_map
@@ -45,6 +47,7 @@ MAX_SIZE = 2**16  # frames of a batch, pixels of a side
 TRIED = 3  # frames that the file is tested on
 SEEDS = 8  # draws of the dimensions that are mirrored: one may leave a map as it is
 DEVIATION = 0.16, 0.5, 0.84  # quantiles a standard deviation below and above the median, and that
+PROBE = ".probe.npz"  # suffix of the file beside it, by which a deployment is checked
 MAX_REASON = 200  # characters of an error of torch
 
 
@@ -111,13 +114,18 @@ class Graph(nn.Module):
     """The exported form of a model: frames (B,C,H,W), or features (B,D), -> scores (B,N), of the best views.
 
     With a sequence: one frame (1,C,H,W) and the state before it -> scores (1,N) and the next state. If it is
-    `centred`, there is a further state, of the mean.
+    `centred`, there is a further state, of the mean. If it is `described`, the last output is the descriptor.
     """
 
     penalties: Tensor
 
     def __init__(
-        self, model: DejaVu, sequence: SequenceModel | None, centred: bool, views: Views = ALONE
+        self,
+        model: DejaVu,
+        sequence: SequenceModel | None,
+        centred: bool,
+        views: Views = ALONE,
+        described: bool = False,
     ) -> None:
         super().__init__()
         parts: dict[str, nn.Module] = {}
@@ -140,8 +148,15 @@ class Graph(nn.Module):
         self.parts = nn.ModuleDict(parts)  # the stages in order
         self.sequence = sequence
         self.centring = running_mean(model.map) if centred else None
+        self.described = described
 
     def forward(self, frames: Tensor, *states: Tensor) -> Tensor | tuple[Tensor, ...]:
+        found = self.outputs(frames, *states)
+        found = found if self.described else found[:-1]
+        return found if len(found) > 1 else found[0]
+
+    def outputs(self, frames: Tensor, *states: Tensor) -> tuple[Tensor, ...]:
+        """All outputs, also the descriptor."""
         after: list[Tensor] = []
         shows = None if "features" in self.parts else (frames.abs().amax(1) > 0)[:, None]
         for name, part in self.parts.items():
@@ -149,6 +164,7 @@ class Graph(nn.Module):
                 shows = part.shows(frames)[:, None]
             if name == "map" and shows is not None:
                 frames = frames * shows.repeat_interleave(self.views, 0).to(frames)
+            descriptor = frames.unflatten(0, (-1, self.views))[:, 0] if name == "map" else frames
             if name == "map" and self.centring is not None:
                 frames, mean = self.centring(frames, states[-1], self.views)
                 after.append(mean)
@@ -158,7 +174,7 @@ class Graph(nn.Module):
         if self.sequence is not None:
             frames, state = self.sequence.step(frames, self.sequence.unpacked(states[0]))
             after.insert(0, self.sequence.packed(state))
-        return (frames, *after) if after else frames
+        return frames, *after, descriptor
 
 
 def export_onnx(
@@ -167,8 +183,10 @@ def export_onnx(
     sequence: SequenceModel | None = None,
     centre: bool = False,
     shifts: Literal["auto", "none"] | list[float] = "auto",
+    descriptor: bool = False,
 ) -> Exported:
-    """Write preprocessing, features, whitening, map and scores as one ONNX file, opset 18.
+    """Write preprocessing, features, whitening, map and scores as one ONNX file, opset 18, and beside it, as
+    `route.probe.npz` of `route.onnx`, what it gives for one picture; see `probe_picture`.
 
     Args:
         model: with a map. A spectral map is decoded: the file holds the float32 descriptors of all places.
@@ -178,11 +196,15 @@ def export_onnx(
             near frames came to the map, see `nearness_of`.
         centre: remove the mean of the frames so far from each, see `RunningMean`, which is a state as well.
         shifts: views of each frame, of which the best has the scores; "auto" are those that the map knows.
+        descriptor: whether `descriptor` (B,K), of the frame as it is, is a further output, the last one.
 
     Shape: `frames` (B,C,H,W) float32 in [0, 1] -> `scores` (B,N), for any B, H and W: frames are resized to
         the size of the map's. For a map of ready features the input is `features` (B,D). With a sequence
         `frames` (1,C,H,W), `state` -> `scores` (1,N), `next_state`. If centred, `mean` (K+1,) is the last
         input, zeros before the first frame, and `next_mean` the last output.
+
+        The probe has the inputs for one frame, with first states, and the outputs of torch for these, by
+        name, and always the `descriptor`; there is none for ready features.
 
     Convention: the metadata's entry "dejavu_torch" is JSON: names and shapes of inputs and outputs, the
         number of places, and if there is one, the threshold, the calibration for single frames, the step
@@ -195,7 +217,9 @@ def export_onnx(
             onnxruntime missing, more than 2 GB, or a file that cannot be written.
     """
     path = Path(path)
+    probe = path.with_suffix(PROBE)
     check_output_file(path)
+    check_output_file(probe)
     os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")  # of onnxruntime, unless the user has set it
     for name in ("onnx", "onnxscript", "onnxruntime"):
         try:
@@ -222,11 +246,13 @@ def export_onnx(
     device = model.map.device
     images = len(model.frame_shape) == 3
     views = model.views_at_first(Sequences(shifts=shifts), images, learns=False)
-    graph = Graph(model, sequence, centre, views)
+    graph = Graph(model, sequence, centre, views, descriptor)
     shape, generator = (TRIED, *model.frame_shape), torch.Generator().manual_seed(0)
     noise = torch.rand(shape, generator=generator, dtype=torch.float32).to(device)
     noise[1:, ..., : noise.shape[-1] // 2], noise[2:] = 0, 0  # half a flat frame, a flat frame
     facts = _facts(model, sequence, centre, views)
+    if descriptor:
+        facts["outputs"]["descriptor"] = [*facts["outputs"]["scores"][:1], model.map.dimension]
     with torch.no_grad(), in_mode(graph, False), _quiet():
         states = [first.to(device) for first in _first_states(facts)]
         inputs = noise[: 2 if sequence is None else 1], *states
@@ -243,6 +269,8 @@ def export_onnx(
     expect(difference <= TOLERANCE, f"at most {TOLERANCE:g}: a part behaves differently in ONNX", seen)
     with whole_file(path) as temporary:
         temporary.write_bytes(written)
+    if images:
+        _write_probe(probe, graph, facts, model.frame_shape)
     return Exported(facts, len(written), difference)
 
 
@@ -278,7 +306,7 @@ def run_session(session: Any, frames: Tensor) -> Tensor:
     states, rows = [state.numpy() for state in _first_states(facts)], []
     for part in frames.cpu().split(1 if "state" in names else max(1, len(frames))):
         given = {name: part.numpy(), **dict(zip(names, states, strict=True))}
-        scores, *states = session.run(None, given)
+        scores, *states = session.run([*facts["outputs"]][: 1 + len(names)], given)
         rows.append(torch.from_numpy(scores))
     return torch.cat(rows)
 
@@ -287,6 +315,17 @@ def _first_states(facts: Facts) -> list[Tensor]:
     """The states before the first frame, from the metadata."""
     first = {"state": float(facts.get("first_state", 0)), "mean": 0.0}
     return [torch.full(shape, first[name]) for name, shape in facts["inputs"].items() if name in first]
+
+
+def _write_probe(path: Path, graph: Graph, facts: Facts, shape: tuple[int, ...]) -> None:
+    """Write what a graph gives for the probe: its inputs and outputs by name, with the descriptor."""
+    inputs = [probe_picture(shape), *_first_states(facts)]
+    with torch.no_grad(), in_mode(graph, False), whole_file(path) as temporary:
+        outputs = graph.outputs(*(one.to(graph.penalties.device) for one in inputs))
+        names = [*facts["inputs"], *dict.fromkeys((*facts["outputs"], "descriptor"))]
+        known = zip(names, (one.cpu().numpy() for one in (*inputs, *outputs)), strict=True)
+        with temporary.open("wb") as file:
+            np.savez(file, **dict(known))
 
 
 def _facts(model: DejaVu, sequence: SequenceModel | None, centre: bool, views: Views) -> Facts:
@@ -395,7 +434,7 @@ def _difference(written: bytes, graph: nn.Module, frames: Tensor, facts: Facts) 
     states, rows = [state.to(frames.device) for state in _first_states(facts)], []
     for part in frames.split(1 if states else len(frames)):
         found = graph(part, *states)
-        scores, *states = found if states else [found]
+        scores, *states = found[: 1 + len(states)] if isinstance(found, tuple) else [found]
         rows.append(scores)
     expected = torch.cat(rows).cpu()
     scores = run_session(session_of(written), frames)

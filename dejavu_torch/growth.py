@@ -421,7 +421,8 @@ def merge(models: Sequence[DejaVu], names: Sequence[str]) -> DejaVu:
     looks = {one.views for one in models}
     views = ALONE if ALONE in looks else first.views if len(looks) == 1 else None
     provenance = Provenance.merged([model.provenance for model in models])
-    merged.state = ModelState(first.frame_shape, first.step, trained, names, None, views, provenance)
+    known = trained, names, None, views, provenance, first.probe
+    merged.state = ModelState(first.frame_shape, first.step, *known)
     dropped = [
         *["thresholds"] * (len(thresholds) > 1),
         *["calibration"] * (calibration is None and any(model.calibration for model in models)),

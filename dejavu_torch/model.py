@@ -25,6 +25,7 @@ from dejavu_torch.features.descriptor import Descriptor, OnFirst, own_size
 from dejavu_torch.features.extract import features_of
 from dejavu_torch.features.joined import Joined
 from dejavu_torch.features.preprocess import Preprocess
+from dejavu_torch.features.probe import probe_of
 from dejavu_torch.features.views import AugmentedFrames, LabelledFrames
 from dejavu_torch.features.whitening import Whitening
 from dejavu_torch.maps.digest import PLACES, digests_of
@@ -50,7 +51,7 @@ from dejavu_torch.recognition.search import Scan, Search, Searcher, check_search
 from dejavu_torch.recognition.select import HIGHEST, PROBABLE, Acceptance, check_candidates
 from dejavu_torch.recognition.smoother import PlaceSmoother
 from dejavu_torch.recognition.views import ALONE, FIRST, LEAST, Views, best_pairs
-from dejavu_torch.resize import reduced_size
+from dejavu_torch.resize import reduced_size, turned_hint
 from dejavu_torch.types import Facts, InputError, Match, SequenceModel, Traverse, expect
 
 if TYPE_CHECKING:
@@ -123,6 +124,7 @@ class DejaVu(nn.Module):
     calibration: Calibration | None
     views: Views | None
     provenance: Provenance
+    probe: tuple[float, ...] | None
 
     def __init__(
         self,
@@ -830,9 +832,9 @@ def _state_of(model: DejaVu, place_map: PlaceMap, traverse: Traverse | None) -> 
         place_map.check()
     along = len(shape) == 3 and learning.looks_along(place_map, model.descriptor, traverse)
     step = traverse.step if isinstance(traverse, ResampledTraverse) else None
-    names = [*source_of(traverse).names]
-    state = model_file.ModelState(shape, step, frame_names=names, views=ALONE if along else None)
-    return replace(state, provenance=Provenance.of(traverse))
+    names, views = [*source_of(traverse).names], ALONE if along else None
+    known = Provenance.of(traverse), probe_of(model.descriptor, shape)
+    return model_file.ModelState(shape, step, None, names, None, views, *known)
 
 
 def require_map(model: DejaVu, purpose: str = "") -> None:
@@ -875,8 +877,8 @@ def check_queries(model: DejaVu, shape: tuple[int, ...], dimension: int, name: s
     seen = f"{name} has frames, but the map was learned from ready features"
     expect(len(reference) != 1, f"features (Q, {expected})", seen)
     own, other = (" x ".join(map(str, size)) for size in (shape, reference))
-    seen = f"{name}: frames of {own} give {dimension} features"
-    expect(dimension == expected, f"{expected}, as frames of {other} give", seen)
+    seen, hint = f"{name}: frames of {own} give {dimension} features", turned_hint(shape, reference)
+    expect(dimension == expected, f"{expected}, as frames of {other} give{hint}", seen)
     if shape[1:] != reference[1:] and getattr(model.descriptor.features, "resize", None) is None:
         log.warning("%s has frames of %s, the map was learned from %s", name, own, other)
 

@@ -6,6 +6,7 @@ file; the caller has to give any other module. Nothing is imported by name.
 
 from __future__ import annotations
 
+import base64
 import inspect
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -14,6 +15,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol, TypeVar
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -95,6 +97,7 @@ class ModelState:
         provenance: where the map comes from, by which queries that are not independent of it are known.
         views: of images alone, which other visits have shown; `ALONE` where moved images show other places of
             the route. None if nothing is known.
+        probe: see `probe_of`; None of ready features, and in files of older versions.
     """
 
     frame_shape: tuple[int, ...] | None = None
@@ -104,6 +107,7 @@ class ModelState:
     calibration: Calibration | None = None
     views: Views | None = None
     provenance: Provenance = field(default_factory=Provenance)
+    probe: tuple[float, ...] | None = None
 
 
 class Model(Protocol):
@@ -246,7 +250,18 @@ def state_to_json(state: ModelState) -> Facts:
     values = {"frame_shape": state.frame_shape, "step": state.step, "trained": trained, "names": names}
     views = {"views": [*zip(*state.views.known, strict=True)]} if state.views is not None else {}
     provenance = {"provenance": stored} if (stored := state.provenance.stored()) else {}
-    return values | {"calibration": calibration, **views, **provenance}
+    probe = {} if state.probe is None else {"probe": _encoded(state.probe)}
+    return values | {"calibration": calibration, **views, **provenance, **probe}
+
+
+def _encoded(numbers: Sequence[float]) -> str:
+    """Numbers as text, float32."""
+    return base64.b64encode(np.array(numbers, "<f4").tobytes()).decode()
+
+
+def _decoded(text: str) -> tuple[float, ...]:
+    """Numbers from the result of `_encoded`."""
+    return tuple(np.frombuffer(base64.b64decode(text, validate=True), "<f4").tolist())
 
 
 def state_from_json(values: Facts, frames: int | None = None) -> ModelState:
@@ -262,6 +277,7 @@ def state_from_json(values: Facts, frames: int | None = None) -> ModelState:
         calibration,
         (pairs := values.get("views")) and Views(*map(tuple, zip(*pairs, strict=True))),  # type: ignore[arg-type]
         Provenance.restored(values.get("provenance", {})),
+        (probe := values.get("probe")) and _decoded(probe),
     )
 
 

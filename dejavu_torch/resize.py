@@ -45,6 +45,13 @@ def is_stretched(own: Size, size: Size) -> bool:
     return not 1 / STRETCHED < ratio < STRETCHED
 
 
+def turned_hint(own: tuple[int, ...], shape: tuple[int, ...]) -> str:
+    """What to try with frames (C,H,W) whose sides have the ratio of others' exchanged sides; else ""."""
+    (high, wide), size = own[1:], (shape[1], shape[2])
+    turned = is_stretched((high, wide), size) and not is_stretched((wide, high), size)
+    return ". If they are turned: ?turn=90 or 270; if height and width are exchanged: transpose" * turned
+
+
 def reduced_size(own: Size, longest: int | None, least: Size | None = None) -> Size:
     """The size (height, width) to reduce frames to, with at most `longest` pixels on the longer side.
 

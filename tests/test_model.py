@@ -195,7 +195,7 @@ def test_what_rounding_changes_is_not_refused():
     frames = pictures(40)
     network = Attending(1e-4)
     DejaVu(network, "none").learn(frames)
-    assert network.sizes == [40, 1]  # one frame more is described
+    assert network.sizes == [40, 1, 1]  # one frame more is described, and the probe
     DejaVu(Attending(0.1), "none").learn(frames.flatten(1)[:, :60])  # ready features
     with torch.autocast("cpu", torch.bfloat16):
         DejaVu(Attending(2e-2), "none").learn(frames)

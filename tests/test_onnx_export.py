@@ -6,9 +6,12 @@ import json
 import math
 import re
 import shlex
+import shutil
+import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from command_line import fails, run
@@ -262,7 +265,10 @@ def test_the_documentation_runs_and_a_filter_goes_from_state_to_state(tmp_path, 
             exec(block, space)
         for line in block.splitlines() if language == "sh" else ():
             run(*shlex.split(line)[1:])
-    found = re.findall(r"^(\d+) (?:True|False)$", capsys.readouterr().out, re.MULTILINE)
+    printed = capsys.readouterr().out
+    assert "\nscores agrees\n" in printed
+    assert space["picture"].dtype == np.uint8
+    found = re.findall(r"^(\d+) (?:True|False)$", printed, re.MULTILINE)
     assert [abs(int(place) - 40) <= 5 for place in found] == [True] * 4
     route = DejaVu.load("road.safetensors").eval()
     model = PlaceFilter().having(nearness=nearness_of(route.map))
@@ -325,3 +331,56 @@ def test_what_has_no_say_about_being_off_the_map_has_a_state_as_before(tmp_path)
         own = sequence.packed(sequence.start(model.map.places, fixed=True))
         queries = torch.rand(30, model.frame_shape[0])
         assert_streams(tmp_path / "map.onnx", model, sequence, [*own.shape], queries)
+
+
+USED = {  # declarations of other libraries that the documentation's C++ uses
+    "cnpy.h": """#include <map>
+#include <string>
+#include <vector>
+namespace cnpy {
+struct NpyArray { std::vector<size_t> shape; size_t num_vals; template <typename T> T* data(); };
+using npz_t = std::map<std::string, NpyArray>;
+npz_t npz_load(std::string);
+}
+""",
+    "onnxruntime_cxx_api.h": """#include <cstdint>
+#include <vector>
+enum OrtAllocatorType { OrtArenaAllocator };
+enum OrtMemType { OrtMemTypeDefault };
+namespace Ort {
+struct Env { Env(); };
+struct SessionOptions { SessionOptions(); };
+struct RunOptions { RunOptions(); };
+struct MemoryInfo { static MemoryInfo CreateCpu(OrtAllocatorType, OrtMemType); };
+struct Value {
+  template <typename T>
+  static Value CreateTensor(const MemoryInfo&, T*, size_t, const int64_t*, size_t);
+  template <typename T> const T* GetTensorData() const;
+};
+struct Session {
+  Session(const Env&, const char*, const SessionOptions&);
+  std::vector<Value> Run(
+    const RunOptions&, const char* const*, const Value*, size_t, const char* const*, size_t);
+};
+}
+""",
+}
+
+
+@pytest.mark.skipif(not shutil.which("g++"), reason="no C++ compiler")
+def test_the_documentations_cpp_compiles(tmp_path):
+    page = (Path(__file__).parents[1] / "docs" / "howto" / "export.md").read_text()
+    (code,) = re.findall(r"```cpp\n(.*?)```", page, re.DOTALL)
+    for name, text in (USED | {"check.cpp": code}).items():
+        (tmp_path / name).write_text(text)
+    words = [
+        "g++",
+        "-std=c++17",
+        "-Wall",
+        "-Werror",
+        "-fsyntax-only",
+        f"-I{tmp_path}",
+        tmp_path / "check.cpp",
+    ]
+    ran = subprocess.run(words, capture_output=True, text=True, check=False)
+    assert ran.returncode == 0, ran.stderr

@@ -27,6 +27,7 @@ from dejavu_torch.data.source import check_not_read, open_source
 from dejavu_torch.data.traverse import chained, kept
 from dejavu_torch.evaluation.options import NO_CALIBRATION
 from dejavu_torch.features.joined import Joined
+from dejavu_torch.features.probe import TOLERANCE, probe_distance
 from dejavu_torch.features.views import SAMPLE as SHORT
 from dejavu_torch.features.views import LabelledFrames
 from dejavu_torch.learning import Checkpoint, MapTasks
@@ -142,20 +143,23 @@ def run_export(
     sequences: Sequences,
     centre: Literal["mean", "none"] = "none",
     threshold: float | None = None,
+    descriptor: bool = False,
     features: nn.Module | None = None,
 ) -> None:
     """Write a map and its features as an ONNX file (opset 18): frames in, scores of all places out.
 
-    With a sequence or a filter, the file also takes a state and returns the next one.
+    With a sequence or a filter, the file also takes a state and returns the next one. route.probe.npz beside
+    route.onnx has what it gives for one picture, to check a deployment with.
 
     Args:
         map: map file
         onnx: file to write (.onnx)
         centre: mean removes the mean of the frames so far from each, as in live
         threshold: threshold to store in the file; the map's own if not given
+        descriptor: a further output, the descriptor of each frame
         features: class of the map's features, if it is not part of dejavu_torch
     """
-    from dejavu_torch.export import OPSET, export_onnx
+    from dejavu_torch.export import OPSET, PROBE, export_onnx
 
     expect(onnx.suffix == ".onnx", "one such as route.onnx", f"--onnx {onnx} is no name of an ONNX file")
     check_output_file(onnx)
@@ -166,12 +170,14 @@ def run_export(
     options.Acceptance(threshold).of(model)
     seen = f"the map's precision, {model.precision}, only holds for single frames in an ONNX file"
     expect(matcher is None or model.precision is None, "--threshold with a sequence or a filter", seen)
-    written = export_onnx(model, onnx, matcher, centre == "mean", sequences.shifts)
+    written = export_onnx(model, onnx, matcher, centre == "mean", sequences.shifts, descriptor)
     for kind in ("inputs", "outputs"):
         shapes = (f"{name} {tuple(shape)}" for name, shape in written.facts[kind].items())
         print(f"{kind}: {', '.join(shapes)}".replace("'", ""))
     size = f"{written.bytes / 1e6:.1f} MB, opset {OPSET}"
     say(f"{size}; {written.difference:.1g} from torch at most, on noise; written to {onnx}")
+    if model.frame_shape is not None and len(model.frame_shape) == 3:
+        say(f"what it gives for one picture, to check a deployment with: {onnx.with_suffix(PROBE)}")
 
 
 def run_refine(
@@ -259,11 +265,12 @@ def run_merge(maps: Sequence[Path], *, map: Path, features: nn.Module | None = N
     print_localize(map, model, command)
 
 
-def run_info(map: Path, *, features: nn.Module | None = None, command: str) -> None:
+def run_info(map: Path, *, check: bool = False, features: nn.Module | None = None, command: str) -> None:
     """Show what a map holds and how it was made.
 
     Args:
         map: map file
+        check: describe a picture that code makes, and compare it with what the map's descriptor made of it
         features: class of the map's features, if it is not part of dejavu_torch
     """
     from dejavu_torch.maps.distance import l1_backend
@@ -271,6 +278,8 @@ def run_info(map: Path, *, features: nn.Module | None = None, command: str) -> N
     from dejavu_torch.periods.spectrogram import BACKEND
 
     model = DejaVu.load(map, features)
+    if check:
+        say(_checked(model, map))
     print_map(model)
     with suppress(InputError):  # a chunk that does not fit into memory
         print(f"single queries: {plan(model.map) or 'all places are scored'}")
@@ -306,6 +315,18 @@ def run_info(map: Path, *, features: nn.Module | None = None, command: str) -> N
     else:
         words = features_words(model, command)
         print_next("learn", "ROUTE", "--descriptor", map, *words, "--map", "route.safetensors")
+
+
+def _checked(model: DejaVu, map: Path) -> str:
+    """What the probe of a map tells, in words; an InputError if frames are described otherwise by now."""
+    if model.probe is None or model.frame_shape is None:
+        why = "maps of ready features, and those of older versions, have none"
+        return f"no probe to check the descriptor with: {why}; learn the map again from images for one"
+    distance = probe_distance(model.descriptor, model.frame_shape, model.probe)
+    seen = f"{map}: the descriptor of the probe is {distance:.2g} of its length from that at learning"
+    others = "other weights, another version of torch or kornia, or TF32, on this machine or that one"
+    expect(distance <= TOLERANCE, f"at most {TOLERANCE:g}; it may be {others}", seen)
+    return f"the probe is described as at learning: {distance:.1g} of its length apart"
 
 
 def check_cluster(cluster: str, device: str, mapper: Mapper | None = None) -> None:

@@ -26,16 +26,17 @@ from dejavu_torch.data.output import check_output_file
 from dejavu_torch.data.source import check_not_read, open_source
 from dejavu_torch.data.traverse import Whole
 from dejavu_torch.evaluation.answers import describe_probable, next_steps, probable_counts
+from dejavu_torch.evaluation.second_look import is_doubtful, second_look
 from dejavu_torch.maps.digest import BYTES, digests_of
 from dejavu_torch.model import DejaVu
 from dejavu_torch.motion.ground_plane import check_corners
 from dejavu_torch.motion.resampling import source_of
 from dejavu_torch.recognition.calibration import TOLERANCE
 from dejavu_torch.recognition.querying import Querying
-from dejavu_torch.recognition.select import Acceptance, check_candidates
+from dejavu_torch.recognition.select import PROBABLE, Acceptance, check_candidates
 from dejavu_torch.recognition.smoother import PlaceSmoother
 from dejavu_torch.text import refuse_with
-from dejavu_torch.types import InputError, Match, Traverse, expect
+from dejavu_torch.types import InputError, Match, SequenceModel, Traverse, expect
 
 NO_DRIVE = "the queries do not look like a drive on this map: each is matched by itself"
 
@@ -95,12 +96,12 @@ def run_localize(
     asked = replace(querying.by(matcher), ordered=ordered)
     digests = [torch.zeros(0, BYTES, dtype=torch.uint8)]
     matches, chosen = _found(model, query, asked, lambda rows: digests.append(digests_of(rows, follow=False)))
-    counts, lost = Counter[str](), set[bool]()
+    counts, ways = Counter[str](), list[SequenceModel]()
 
     def counted() -> Iterator[Match]:
         for match in matches:
             counts.update(probable_counts(match))
-            lost.add(match.smoother is not None and not match.is_drive)
+            ways.extend([] if match.smoother is None else [match.smoother])
             yield match
 
     with ExitStack() as stack:
@@ -114,7 +115,7 @@ def run_localize(
         print("the map has no layers, so no place can be reported")
     elif not chosen.given:
         print(chosen)
-    if querying.loops is None and any(lost):
+    if querying.loops is None and not all(way.is_drive for way in ways):
         print(NO_DRIVE)
     if querying.loops is None:
         for doubt in model.provenance.doubts(model.map, torch.cat(digests), query):
@@ -123,6 +124,10 @@ def run_localize(
         one, many = min(damaged), len(damaged)
         print(f"{many} frame{'s' * (many > 1)} could not be read, such as {one}: {damaged[one]}")
     say(f"{total} queries, {accepted} accepted; written to {out}")
+    told = bool(counts) and querying.loops is None and cluster is None
+    if told and is_doubtful(counts[f"{PROBABLE:g}"], total, next(iter(ways), None)):
+        for doubt in second_look(model, query, bool(ordered)):
+            say(str(doubt))
     if counts:
         steps = next_steps(matcher is not None and querying.loops is None, chosen.given)
         probable = f"{describe_probable(counts, total)}, of being within {TOLERANCE} places"

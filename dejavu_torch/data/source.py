@@ -26,6 +26,7 @@ from dejavu_torch.data.h5 import H5_SUFFIXES, DescriptorFile
 from dejavu_torch.data.simulate import SIMULATED
 from dejavu_torch.data.strip import read_strip
 from dejavu_torch.data.traverse import Cropped, Frames, frame_range
+from dejavu_torch.data.turning import Upright
 from dejavu_torch.data.video import VIDEO_SUFFIXES, Video
 from dejavu_torch.types import Facts, InputError, Traverse, expect
 
@@ -42,7 +43,7 @@ PICTURES: dict[str, Callable[..., Traverse]] = {"strip:": read_strip, "grid:": r
 PICTURES["path:"] = read_flight
 KINDS = {int: "integer", float: "floating-point number"}  # types of option values
 PART = {"start": 0, "stop": 0, "step": 1}  # options of every source, see `frame_range`
-EVERY = PART | {"coordinates": "", "crop": "", "mask": ""}
+EVERY = PART | {"coordinates": "", "turn": "", "crop": "", "mask": ""}
 EXPECTED = (
     "a folder of images or a video, such as clip.mp4?width=160, an .npy file of frames or features, an .h5 "
     "file of hloc, demo:road?traverse=0, sim:aerial?seed=0&traverse=0&frames=3072, sim:outdoor, "
@@ -83,7 +84,8 @@ def open_source(source: str | Path) -> Traverse:
             `path:IMAGE?points=track.csv&window=64&scale=.5`, windows along a path over it, see `read_flight`.
             For all sources but areas, `start=`, `stop=` and `step=` select every step-th of the frames
             [start, stop). `coordinates=FILE` tells where frames were taken, see `read_coordinates`.
-            `mask=IMAGE` makes what is black in an image black in all frames, then
+            `turn=90`, 180 or 270 turns frames clockwise, in degrees, `turn=mirror` exchanges left and right;
+            then `mask=IMAGE` makes what is black in an image black in all frames, then
             `crop=TOP,BOTTOM,LEFT,RIGHT` removes pixels.
 
     Raises:
@@ -100,14 +102,16 @@ def open_source(source: str | Path) -> Traverse:
     reader = _reader(text, address)
     arguments = _arguments(text, query, reader)
     part = {name: arguments.pop(name) for name in PART if name in arguments}
-    file, crop, mask = (arguments.pop(name, "") for name in ("coordinates", "crop", "mask"))
+    file, turn, crop, mask = (arguments.pop(name, "") for name in ("coordinates", "turn", "crop", "mask"))
     traverse = reader(**arguments)
-    if crop or mask:
-        hidden = read_image(Path(mask)).mean(0, keepdim=True) if mask else None
-        traverse = Cropped(traverse, _sides(text, crop), hidden)
     if file:
         traverse.coordinates, headings = read_coordinates(Path(file), traverse)
         traverse.headings = traverse.headings if headings is None else headings
+    if turn:
+        traverse = Upright(traverse, turn)
+    if crop or mask:
+        hidden = read_image(Path(mask)).mean(0, keepdim=True) if mask else None
+        traverse = Cropped(traverse, _sides(text, crop), hidden)
     return frame_range(traverse, **part) if part else traverse
 
 

@@ -171,9 +171,9 @@ def column_of(title: str) -> Column:
 
 
 def number(text: str) -> float:
-    """A number of any size; NaN for anything else."""
+    """A number of any size, also with a decimal comma; NaN for anything else."""
     try:
-        value = float(text)
+        value = float(text.replace(",", "."))
     except ValueError:
         return math.nan
     return value if math.isfinite(value) else math.nan

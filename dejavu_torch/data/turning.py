@@ -1,17 +1,59 @@
-"""Images of a camera that looks down, turned about their middle so that north is up."""
+"""Images that are turned: by quarters, as a camera that is mounted so needs, or so that north is up."""
 
 from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from functools import cached_property
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from dejavu_torch.data.traverse import Part
+from dejavu_torch.data.traverse import Part, at_size
 from dejavu_torch.memory import without_autocast
 from dejavu_torch.places.layout import Layout
 from dejavu_torch.types import Traverse, expect
 
 MOST = 360  # headings of an image that are tried
+# frames (..., H, W) turned clockwise, in degrees, with left and right or height and width exchanged
+TURNS: Mapping[str, Callable[[Tensor], Tensor]] = {
+    "90": lambda frames: frames.rot90(-1, (-2, -1)),
+    "180": lambda frames: frames.flip(-2, -1),
+    "270": lambda frames: frames.rot90(1, (-2, -1)),
+    "mirror": lambda frames: frames.flip(-1),
+    "transpose": lambda frames: frames.transpose(-2, -1),
+}
+# degrees by which the upper side turns; of a transposed frame it is the former left one
+QUARTERS = {"90": 90, "180": 180, "270": 270, "mirror": 0, "transpose": 90}
+
+
+class Upright(Part):
+    """Frames turned by one of `TURNS`, for a camera that is mounted otherwise, or mirrored.
+
+    Raises:
+        InputError: another turn, ready features, or an area.
+    """
+
+    def __init__(self, traverse: Traverse, turn: str) -> None:
+        super().__init__(traverse, range(len(traverse)))
+        seen = f"{traverse.name}: turn={turn}"
+        expect(turn in TURNS, f"{', '.join(TURNS)}, clockwise", seen)
+        expect(len(traverse.frame_shape) == 3, "frames, which can be turned", seen)
+        traverse.layout.expect_route("a route: windows of an area are turned by --headings", seen)
+        self.turn = turn
+        self.headings = None if self.headings is None else (self.headings - QUARTERS[turn]) % 360
+
+    def read(self, frames: range | list[int]) -> Tensor:
+        return TURNS[self.turn](super().read(frames)).contiguous()
+
+    def decoded_at(self, height: int, width: int) -> Upright:
+        """The frames at another size, of which the images are decoded at theirs."""
+        size = (width, height) if QUARTERS[self.turn] % 180 else (height, width)
+        return self.changed(traverse=at_size(self.traverse, size), sized=True)
+
+    @cached_property
+    def frame_shape(self) -> tuple[int, ...]:
+        return tuple(TURNS[self.turn](torch.empty(self.traverse.frame_shape, device="meta")).shape)
 
 
 @without_autocast

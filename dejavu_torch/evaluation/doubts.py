@@ -12,8 +12,10 @@ from dejavu_torch.data.ground_truth import Truth, check_ground_truth, scored_and
 from dejavu_torch.evaluation.agreement import Ground, Judged, coarse, contradictions
 from dejavu_torch.evaluation.answers import describe_line
 from dejavu_torch.evaluation.localization import Localization
+from dejavu_torch.evaluation.second_look import is_doubtful, second_look
 from dejavu_torch.maps.digest import digests_of
 from dejavu_torch.motion.resampling import source_of
+from dejavu_torch.recognition.select import PROBABLE
 from dejavu_torch.types import Doubt, Facts, Match, Traverse
 
 CONTRADICT = "the answers contradict the truth"
@@ -25,7 +27,19 @@ def doubts_of(run: Localization, truth: Truth | None, facts: Mapping[str, Any]) 
         return []
     asked = run.query_features if run.causal_features is None else run.causal_features
     digests = digests_of(asked[:: run.querying.copies], follow=False)
-    return _judged(run, truth, facts) + run.model.provenance.doubts(run.model.map, digests, run.query)
+    known = run.model.provenance.doubts(run.model.map, digests, run.query)
+    return [*_judged(run, truth, facts), *known, *_otherwise(run)]
+
+
+def _otherwise(run: Localization) -> list[Doubt]:
+    """How frames would be found of which few are."""
+    match = run.match
+    if match.probability is None:
+        return []
+    found = int((match.probability >= PROBABLE).sum())
+    ordered = run.way is not None or source_of(run.query).ordered
+    doubtful = is_doubtful(found, len(match), match.smoother)
+    return second_look(run.model, run.query, ordered) if doubtful else []
 
 
 def _judged(run: Localization, truth: Truth | None, facts: Mapping[str, Any]) -> list[Doubt]:

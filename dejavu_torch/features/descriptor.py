@@ -32,6 +32,7 @@ from dejavu_torch.features.shared import Blocks, Sharing, Windows
 from dejavu_torch.features.views import SAMPLE, AugmentedFrames, LabelledFrames, Sample, augmented_route
 from dejavu_torch.features.whitening import INDEPENDENT, MOST_VIEWS, WIDEST, Visits, Whitening
 from dejavu_torch.memory import IN_MEMORY, concatenate
+from dejavu_torch.resize import turned_hint
 from dejavu_torch.text import progress_of
 from dejavu_torch.types import BATCH_NUMBERS, BATCH_SIZE, InputError, Traverse, expect
 
@@ -485,6 +486,8 @@ class Descriptor(nn.Module):
                 )
                 swapped = is_ready(reference) and is_ready(query) and len(reference) == len(query)
                 hint = ". If rows and columns are swapped, save the transposes" if swapped else ""
+                frames = not is_ready(reference) and not is_ready(query)
+                hint = turned_hint(query.frame_shape, reference.frame_shape) if frames else hint
                 raise InputError(f"{seen}; expected the same number, from frames of the same size{hint}")
         return counts[0]
 

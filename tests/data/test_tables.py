@@ -60,6 +60,10 @@ def test_units_are_removed(tmp_path):
     np.testing.assert_allclose(table.numbers("x"), [1.5, np.nan])
 
 
+def test_decimal_commas_between_semicolons(tmp_path):
+    assert table_of("x;y\n1,5;-2\n", tmp_path).numbers("x").tolist() == [1.5]
+
+
 def test_the_plain_name_goes_before_another_that_means_the_same(tmp_path):
     table = table_of("t,time,pos_x,x\n1,2,3,4\n", tmp_path)
     assert table.numbers("time").tolist() == [2]
