@@ -106,7 +106,7 @@ def open_source(source: str | Path) -> Traverse:
         hidden = read_image(Path(mask)).mean(0, keepdim=True) if mask else None
         traverse = Cropped(traverse, _sides(text, crop), hidden)
     if file:
-        traverse.coordinates, headings = read_coordinates(Path(file), traverse)
+        traverse.coordinates, headings, traverse.odometer = read_coordinates(Path(file), traverse)
         traverse.headings = traverse.headings if headings is None else headings
     return frame_range(traverse, **part) if part else traverse
 

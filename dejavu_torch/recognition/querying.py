@@ -9,12 +9,12 @@ from functools import partial
 from pathlib import Path
 from typing import Literal
 
-from torch import Tensor
 from typing_extensions import Self
 
 from dejavu_torch.data.turning import facing_north
 from dejavu_torch.places.layout import Layout
 from dejavu_torch.recognition.filter import PlaceFilter
+from dejavu_torch.recognition.odometry import Moved
 from dejavu_torch.recognition.scorer import BestHeading, Earlier, Scorer
 from dejavu_torch.recognition.sequence import SequenceMatcher
 from dejavu_torch.recognition.smoother import PlaceSmoother
@@ -94,7 +94,22 @@ class Sequences:
 
 
 @dataclass(frozen=True)
-class Querying(Sequences):
+class Drives(Sequences):
+    """How consecutive queries are matched together.
+
+    Args:
+        moved: odometry, for a drive or a filter: a csv with a column moved, in places since the frame before,
+            or moved_m, in metres, and perhaps moved_spread; or `coordinates`, the distances between the
+            source's own. By default a column moved of its file of coordinates
+        metres_per_place: of the map: a number, or its reference with coordinates; a drive finds it by itself
+    """
+
+    moved: str | Path | Moved | None = None
+    metres_per_place: str | float | None = None
+
+
+@dataclass(frozen=True)
+class Querying(Drives):
     """How queries are matched.
 
     Args:
@@ -116,7 +131,6 @@ class Querying(Sequences):
     top: int | None = None
     loops: int | None = None
     headings: int = 1
-    moved: Path | Tensor | None = field(default=None, metadata=PYTHON)
     views: Views = field(default=ALONE, metadata=PYTHON)
 
     def order(self, matcher: SequenceModel | Literal["auto"] | None) -> bool | None:
@@ -163,4 +177,5 @@ class Querying(Sequences):
 
 
 SEQUENCES = Sequences()
+DRIVES = Drives()
 QUERYING = Querying()  # by the whole drive if queries are in order, else each by itself

@@ -31,9 +31,10 @@ ONE = (SLIP, 1 - 2 * SLIP, SLIP)
 
 
 def test_a_drive_in_steps_of_one_place():
-    steps = odometry.steps_of(torch.tensor([0.0, 1, 0, 3, 0.4, 0.4, 0.4]))
-    assert steps.queries.tolist() == [0, 1, 2, -1, -1, 3, 4, 5, 6]
-    assert steps.still.tolist() == [True, False, True, False, False, False, True, False, True]
+    moved = torch.tensor([0.0, 1, 0, 3, 0.4, 0.4, 0.4])
+    queries, still = odometry.steps_of(odometry.checked_moved(moved, 7))
+    assert queries.tolist() == [0, 1, 2, -1, -1, 3, 4, 5, 6]
+    assert still.tolist() == [True, False, True, False, False, False, True, False, True]
 
 
 @given(st.lists(st.floats(0, 3), min_size=1, max_size=8), st.integers(0, 99))
@@ -43,15 +44,14 @@ def test_a_smoother_takes_steps_of_one_place(moved, seed):
     moved[0] = 0
     scores = noise(len(moved), 5, seed=seed).double()
     smoother = PlaceSmoother(moved=moved).double()
-    steps, drive = odometry.steps_of(moved), smoother.drive(scores)
+    drive = smoother.drive(scores)
+    queries, still = odometry.steps_of(drive.moved)
     log = drive.log_likelihood(torch.arange(len(moved)))
-    rows = [log[i].tolist() if i >= 0 else [0.0] * 5 for i in steps.queries.tolist()]
+    rows = [log[i].tolist() if i >= 0 else [0.0] * 5 for i in queries.tolist()]
     jump, leave, enter = 0.001, 0.001, 0.01
     with torch.no_grad():
-        known, _ = forward_backward(
-            Steps(5, ONE, jump, leave, enter, smoother.turn), rows, steps.still.tolist()
-        )
-    states = torch.tensor(known)[steps.queries >= 0]
+        known, _ = forward_backward(Steps(5, ONE, jump, leave, enter, smoother.turn), rows, still.tolist())
+    states = torch.tensor(known)[queries >= 0]
     there, back = states[:, :-1].chunk(2, 1)
     expected = torch.cat([there + back.flip(1), states[:, -1:]], 1).double()
     with pytest.MonkeyPatch.context() as patch:
