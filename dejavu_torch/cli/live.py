@@ -130,12 +130,7 @@ def _stay(url: str) -> None:
 
 
 def frames_from(
-    source: str,
-    model: DejaVu,
-    realtime: bool,
-    shown: bool = False,
-    sequence: SequenceModel | None = None,
-    asked: Drives = DRIVES,
+    source: str, model: DejaVu, realtime: bool, shown: bool, sequence: SequenceModel | None, asked: Drives
 ) -> tuple[Iterable[Frame], bool, str, bool, Odometer | None]:
     """The frames of a source, whether older ones are dropped, its name, whether they are turned north, and
     what an odometer reads at them.

@@ -29,7 +29,8 @@ EXPECTED = "uint8 (H,W), (H,W,3) or (3,H,W), or float in [0, 1], or float (D,) f
 DTYPES = ("uint8", "float16", "bfloat16", "float32", "float64")
 SMALL = (HOG, Distilled, PatchPixels)  # features that one thread computes as fast as several
 MAX_SKIPPED = 100  # skipped frames that a filter moves for; after more, a jump finds the place again
-TOLD = "accepted", "probability", "shift", "shift_degrees", "stale"  # columns of a match, if they are known
+# columns of a match, and what stands for those that are not known
+TOLD = {"accepted": True, "stale": 0, **dict.fromkeys(("probability", "shift", "shift_degrees"), math.nan)}
 ROUNDING = 1e-3  # tolerance of the range [0, 1]
 Move: TypeAlias = "float | Sequence[float] | Tensor | None"  # places, or these and their standard deviation
 
@@ -192,7 +193,7 @@ class LiveLocalizer:
         shown, layout = int(table.frame_of(match.index)), model.map.layout
         x, y = layout.coordinates(match.index).tolist()
         columns = {name: column.item() for name, column in match.columns.items()}
-        told: Facts = {name: columns[name] for name in TOLD if name in columns}
+        told: Facts = {name: columns.get(name, missing) for name, missing in TOLD.items()}
         return LiveMatch(
             place=place,
             frame=int(table.own_frame_of(match.index)),
@@ -203,7 +204,7 @@ class LiveLocalizer:
             route=layout.names("")[int(layout.route_of(match.index))] if place >= 0 else "",
             x=x,
             y=y,
-            **{"probability": math.nan} | told,
+            **told,
         )
 
     @property
