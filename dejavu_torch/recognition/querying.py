@@ -98,10 +98,8 @@ class Drives(Sequences):
     """How consecutive queries are matched together.
 
     Args:
-        moved: odometry, for a drive or a filter: a csv with a column moved, in places since the frame before,
-            or moved_m, in metres, and perhaps moved_spread; or `coordinates`, the distances between the
-            source's own. By default a column moved of its file of coordinates
-        metres_per_place: of the map: a number, or its reference with coordinates; a drive finds it by itself
+        moved: odometry: csv with a column moved, in places, or moved_m; or coordinates, the source's own
+        metres_per_place: of the map: a number, or its reference
     """
 
     moved: str | Path | Moved | None = None
@@ -114,7 +112,7 @@ class Querying(Drives):
 
     Args:
         ordered: queries are in order, as in a video; needed for a .npy of frames
-        unordered: queries are in no order: match each by itself
+        unordered: in no order: match each by itself
         centre: mean removes what all queries share but the map does not; default for 50 or more in order
         top: places per query, no two within the tolerance (localize: 5), each in a row with its rank; only
             the first has a probability

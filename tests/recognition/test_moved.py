@@ -337,7 +337,7 @@ def test_the_speed_of_a_drive(model, route, tmp_path):
 
 def test_a_comparison_by_odometry(route, tmp_path):
     at, moved = irregular(150, 300)
-    queries = route[at] + 1.8 * torch.randn(len(at), 32, generator=torch.Generator().manual_seed(1))
+    queries = route[at] + 1.5 * torch.randn(len(at), 32, generator=torch.Generator().manual_seed(1))
     truth = {query: [int(place)] for query, place in enumerate(at)}
     (tmp_path / "t.csv").write_text("query,place\n" + "\n".join(f"{q},{p[0]}" for q, p in truth.items()))
 
@@ -348,8 +348,8 @@ def test_a_comparison_by_odometry(route, tmp_path):
         return found.ours.sequences, found.facts["drive"]
 
     (plain, _), (told, drive) = scores(), scores(moved=moved)
-    for way in ("filter", "smoother"):
-        assert told[way].auc > plain[way].auc
+    assert told["filter"].auc > plain["filter"].auc + 0.05
+    assert told["smoother"].auc > 0.95
     assert drive["speed"] == pytest.approx(float(moved.mean()), abs=0.4)
     in_metres, _ = scores(moved=metres(moved))  # which only the drive can use
     assert in_metres["smoother"].auc == pytest.approx(told["smoother"].auc, abs=0.02)
