@@ -24,6 +24,7 @@ from benchmarks.files import NAMES as FILES
 from benchmarks.headings import NAMES as HEADING_WAYS
 from benchmarks.measure import Row, programs
 from benchmarks.order import gains
+from benchmarks.provenance import BETWEEN, FAST, NETWORK, OWN, PART, VISIT
 from benchmarks.results import FOOTAGE, kept, rounded
 from benchmarks.storage import SHOWN, best, by, families, missed
 from benchmarks.storage_drives import drive_table
@@ -33,6 +34,7 @@ from benchmarks.views import POINTED, POINTED_WITHIN, WAYS
 from dejavu_torch.evaluation.baselines import every
 from dejavu_torch.evaluation.contenders import LENGTHS
 from dejavu_torch.recognition.calibration import POWER
+from dejavu_torch.recognition.provenance import STEADY
 
 FOLDER, DOCS = Path(__file__).parent / "results", Path(__file__).parents[1] / "docs"
 README = DOCS.parent / "README.md"
@@ -597,6 +599,28 @@ def loops() -> str:
     return markdown(table)
 
 
+def provenance() -> str:
+    """Signs beyond two queries of second visits and of a map's own drive; what is told is bold."""
+    found: dict[str, dict[str, Row]] = {}
+    for row in read("provenance")["rows"]:
+        if row.get("places") is not None:
+            found.setdefault(row["case"], {})[row["contender"]] = row
+    ways = VISIT, FAST, PART, BETWEEN
+    table = [["", *ways, f"{OWN}: share of equal ones"]]
+    for case, own in found.items():
+        bold = ["**" * bool(own[way]["told"]) for way in ways]
+        cells = [f"{star}{own[way]['beyond']:.2f}{star}" for way, star in zip(ways, bold, strict=True)]
+        name = f"{case}, chosen on" if own[VISIT]["chosen"] else case
+        table.append([name, *cells, f"{own[OWN]['same']:.2f}"])
+    known = [row for row in read("provenance")["rows"] if row.get("correlation") is not None]
+    foreign = [row["correlation"] for row in known if row["contender"].startswith(NETWORK)]
+    steady = [row for row in known if row["steady"] >= STEADY]
+    visits = [row["correlation"] for row in steady if row["contender"].startswith(VISIT)]
+    said = f"{len(visits)} second visits {min(visits):.2f} at least"
+    said += "".join(f", of {len(foreign)} pairs of networks {max(foreign):.2f} at most" for _ in foreign[:1])
+    return f"{markdown(table)}\nCorrelation of means of ready descriptors: of {said}.\n"
+
+
 def by_case(wanted: Callable[[Row], bool]) -> dict[str, dict[str, list[str]]]:
     """Right of accepted answers by precision, of each way in a case of `benchmarks alike`."""
     found: dict[str, dict[str, list[str]]] = {}
@@ -670,7 +694,7 @@ TABLES: dict[str, Callable[[], str]] = {
         "visits": visits,
     },
     **{name: partial(features, name) for name in ("features", "cells", "copies")},
-    **{"alike": lambda: f"{look_alikes()}\n{loops()}"},
+    **{"alike": lambda: f"{look_alikes()}\n{loops()}", "provenance": provenance},
     **{f"storage {name}": partial(storage, name) for name in ("aerial", "road1", "road2", "city", "railway")},
 }
 

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from dejavu_torch import learning
 from dejavu_torch.data.ground_truth import find_ground_truth, names_agree
+from dejavu_torch.data.maker import check_maker
 from dejavu_torch.data.source import Source, as_traverse
 from dejavu_torch.data.traverse import chained
 from dejavu_torch.features.views import LabelledFrames
@@ -26,6 +27,7 @@ from dejavu_torch.places.frame_table import FrameTable
 from dejavu_torch.places.layout import agree
 from dejavu_torch.places.positions import positions_behind
 from dejavu_torch.recognition.calibration import strictest
+from dejavu_torch.recognition.provenance import Provenance
 from dejavu_torch.recognition.views import ALONE
 from dejavu_torch.teaching import FEWEST, calibrate_by, place_drives
 from dejavu_torch.types import InputError, Traverse, expect
@@ -112,7 +114,8 @@ def append(
     frames = len(positions) or places
     names = [model.frame_names, [*source_of(added).names]]
     model.frame_names = joined_names(names, [place_map.table.frames, frames])
-    return model.replace_map(grown)
+    model.replace_map(grown)
+    return model if visits is None else model.taught_by(*visits[:2])
 
 
 def learn_mean(
@@ -179,13 +182,13 @@ def average(model: DejaVu, visits: LabelledFrames, progress: bool = False) -> in
         rows = descriptors[inside].to(place_map.device)
         means = learning.with_visits(place_map.decode(g), counts[start:stop], rows, places[inside] - start)
         settings = place_map.transform, place_map.resolution, chunk.columns
-        return encode_chunk(means, place_map.means[0], chunk.step, *settings)
+        return encode_chunk(means, place_map.means[0], chunk.step, *settings)._replace(digest=chunk.digest)
 
     mean = place_map.of_chunks(averaged(g, chunk) for g, chunk in enumerate(place_map.coded()))
     mean.laid_out(place_map.layout).positions = place_map.positions
     mean.count_visits((counts + seen).to(place_map.visits.device))
     mean.check()
-    model.replace_map(mean)
+    model.replace_map(mean).taught_by(*visits[:2])
     return int((seen > 0).sum())
 
 
@@ -417,7 +420,8 @@ def merge(models: Sequence[DejaVu], names: Sequence[str]) -> DejaVu:
     names = joined_names([model.frame_names for model in models], frames)
     looks = {one.views for one in models}
     views = ALONE if ALONE in looks else first.views if len(looks) == 1 else None
-    merged.state = ModelState(first.frame_shape, first.step, trained, names, views=views)
+    provenance = Provenance.merged([model.provenance for model in models])
+    merged.state = ModelState(first.frame_shape, first.step, trained, names, None, views, provenance)
     dropped = [
         *["thresholds"] * (len(thresholds) > 1),
         *["calibration"] * (calibration is None and any(model.calibration for model in models)),
@@ -487,6 +491,11 @@ def _difference(first: DejaVu, other: DejaVu) -> str:
         )
     if seen := first.map.layout.unlike(other.map.layout):
         return f"{seen}; expected the same"
+    makers = first.provenance.maker, other.provenance.maker
+    if all(makers) and len({*makers}) > 1:
+        return (
+            f"{makers[0]!r} made the descriptors of one, {makers[1]!r} those of the other; expected the same"
+        )
     shapes = first.frame_shape, other.frame_shape
     if None not in shapes and not _compatible(first, *shapes):  # type: ignore[arg-type]
         sizes = " and ".join(" x ".join(map(str, shape or ())) for shape in shapes)
@@ -512,6 +521,7 @@ def _check_compatible(model: DejaVu, added: Traverse) -> None:
     if model.step is not None and not isinstance(added, ResampledTraverse):
         seen = f"{added.name} has ready features or a single frame, without measurable steps"
         raise InputError(f"{seen}; expected frames, as the map's places are even steps along the ground")
+    check_maker(model.provenance.maker, "the map", added)
     shape = added.frame_shape
     stored = model.frame_shape or shape  # None for a map learned from descriptors
     if not _compatible(model, stored, shape):
@@ -522,6 +532,8 @@ def _check_compatible(model: DejaVu, added: Traverse) -> None:
         raise InputError(f"{added.name} has {seen}, the map was learned from {learned}; expected the same")
     count, expected = model.descriptor.count_features(added), features_per_frame(model)
     expect(count == expected, f"{expected}, as in the map", f"{added.name} gives {count} features per frame")
+    told = 'or {"maker": ...} in the .json beside both, if one network made them'
+    expect(not (seen := model.provenance.unlike(added)), f"the map's, {told}", seen)
 
 
 def _compatible(model: DejaVu, stored: tuple[int, ...], shape: tuple[int, ...]) -> bool:

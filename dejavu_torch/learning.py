@@ -31,6 +31,7 @@ from dejavu_torch.features.views import (
     views_of,
 )
 from dejavu_torch.features.whitening import STRENGTHS
+from dejavu_torch.maps.digest import Digest, digests_of
 from dejavu_torch.maps.file import part_of, read_map, write_map
 from dejavu_torch.maps.place_map import Mapper, PlaceMap
 from dejavu_torch.maps.spectral import SpectralMapper, encode_chunk
@@ -41,6 +42,7 @@ from dejavu_torch.motion.resampling import ResampledTraverse
 from dejavu_torch.places.layout import Layout
 from dejavu_torch.recognition.calibration import TOLERANCE, Calibration, calibrated, confidence
 from dejavu_torch.recognition.centring import learn_turned
+from dejavu_torch.recognition.provenance import check_independent
 from dejavu_torch.recognition.scorer import OfMap
 from dejavu_torch.recognition.views import SHIFTS, best_pairs
 from dejavu_torch.text import progress_of
@@ -79,11 +81,13 @@ class ChunkEncoder:
         """A chunk from these frames; InputError as from `feature_batches` and `encode_chunk`."""
         with torch.no_grad(), in_one_thread():
             rows = torch.cat(list(self.descriptor.batches(Part(self.traverse, frames), shared=True)))
+            digest = Digest(torch.arange(len(rows)), digests_of(rows))
             if self.visits is not None:
                 shown = views_of(self.visits, torch.arange(frames.start, frames.stop))
                 rows = averaged(self.descriptor, rows, shown)
             columns = self.traverse.layout.columns_from(frames.start)
-            return encode_chunk(rows, self.mean, self.step, self.transform, self.resolution, columns)
+            chunk = encode_chunk(rows, self.mean, self.step, self.transform, self.resolution, columns)
+            return chunk._replace(digest=digest)  # of the reference, not of means of visits
 
 
 class Checkpoint:
@@ -291,6 +295,7 @@ def learn_descriptors(mapper: Mapper, descriptors: Tensor, layout: Layout) -> Pl
         seen = f"{place_map.places} places and {place_map.dimension} features"
         seen = f"{type(mapper).__name__} made a map of {seen}"
         raise InputError(f"{seen} from features {tuple(descriptors.shape)}; expected the same numbers")
+    place_map.know(descriptors)
     return place_map
 
 
@@ -366,6 +371,8 @@ def calibration_of(
     name = views.traverse.name
     batches = descriptor.batches(views.traverse, progress, "calibrating")
     descriptors = concatenate(batches, len(views.traverse))
+    if another:
+        check_independent(place_map, views.traverse, descriptors)
     parts = zip(descriptors.split(length), views.places.split(length), strict=True)
     own = None
     if reference is not None and isinstance(place_map, SpectralMap):

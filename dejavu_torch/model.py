@@ -16,9 +16,10 @@ from torch import Tensor, nn
 from torch.nn.parameter import is_lazy
 
 from dejavu_torch import learning, model_file
+from dejavu_torch.data.maker import check_maker
 from dejavu_torch.data.moving import unmoved
 from dejavu_torch.data.source import Source, as_traverse
-from dejavu_torch.data.traverse import Part, at_size, resize_like, size_like
+from dejavu_torch.data.traverse import Part, at_size, parts_of, resize_like, size_like
 from dejavu_torch.data.turning import is_turned
 from dejavu_torch.features.descriptor import Descriptor, OnFirst, own_size
 from dejavu_torch.features.extract import features_of
@@ -26,6 +27,7 @@ from dejavu_torch.features.joined import Joined
 from dejavu_torch.features.preprocess import Preprocess
 from dejavu_torch.features.views import AugmentedFrames, LabelledFrames
 from dejavu_torch.features.whitening import Whitening
+from dejavu_torch.maps.digest import PLACES, digests_of
 from dejavu_torch.maps.place_map import Mapper, PlaceMap
 from dejavu_torch.maps.spectral import SpectralMapper
 from dejavu_torch.maps.spectral_map import SpectralMap
@@ -41,6 +43,7 @@ from dejavu_torch.recognition.drive import FEWER
 from dejavu_torch.recognition.large import is_large
 from dejavu_torch.recognition.localizer import SINGLE, Localizer, Matching, answer
 from dejavu_torch.recognition.odometry import Moved, moves_of
+from dejavu_torch.recognition.provenance import Provenance
 from dejavu_torch.recognition.querying import QUERYING, Drives, Querying, Sequences
 from dejavu_torch.recognition.scorer import Earlier, OfMap, Scorer
 from dejavu_torch.recognition.search import Scan, Search, Searcher, check_search
@@ -119,6 +122,7 @@ class DejaVu(nn.Module):
     frame_names: list[str]
     calibration: Calibration | None
     views: Views | None
+    provenance: Provenance
 
     def __init__(
         self,
@@ -255,14 +259,17 @@ class DejaVu(nn.Module):
             else:
                 if checkpoint is not None:
                     checkpoint.check_unused()
-                rows = descriptor.learn(traverse, second, progress, isinstance(mapper, SpectralMapper))
+                rows = own = descriptor.learn(traverse, second, progress, isinstance(mapper, SpectralMapper))
                 if visits is not None:
-                    rows = learning.averaged(descriptor, rows, visits, progress)
+                    rows = learning.averaged(descriptor, own, visits, progress)
                 learned = learning.learn_descriptors(mapper, rows, traverse.layout)
+                learned.know(own)
             if counts is not None:
                 learned.count_visits(learned.visit_counts + counts.to(learned.device))
             learning.count_drives(learned, second)
         self.replace_map(learned, _state_of(self, learned, traverse))
+        for views in filter(None, (visits, second)):
+            self.taught_by(*views[:2])
         return self if second is None else self.look_at(second.traverse)
 
     def learn_features(
@@ -285,7 +292,7 @@ class DejaVu(nn.Module):
         learned = learning.learn_descriptors(self.mapper, features, layout)
         learning.count_drives(learned, second)
         self.replace_map(learned, _state_of(self, learned, traverse))
-        return self if second is None else self.look_at(second.traverse)
+        return self if second is None else self.taught_by(*second[:2]).look_at(second.traverse)
 
     def resample(
         self,
@@ -378,7 +385,7 @@ class DejaVu(nn.Module):
             route = self.at_map_size(as_traverse(reference), self.frame_shape or ())
         known = route, views, places, progress, reach
         self.calibration = learning.calibration_of(self.descriptor, self.map, *known)
-        return self if views is None else self.look_at(views.traverse)
+        return self if views is None else self.taught_by(*views[:2]).look_at(views.traverse)
 
     def forward(self, queries: Tensor) -> Tensor:
         """Section III-B: scores of all places, differentiable (eq. 3, eq. 4)."""
@@ -511,10 +518,11 @@ class DejaVu(nn.Module):
         progress: bool = False,
         search: Search | None = None,
         apart: int = 5,
+        heard: Callable[[Tensor], object] = id,
     ) -> Iterator[Match]:
         """As `localize`, with `top` as `candidates`, or as `loops`: one batch of queries at a time, in
         constant memory, or after the descriptors of all with a smoother, centred queries, headings, or views
-        that single images in order have to show."""
+        that single images in order have to show. `heard` gets the descriptors of the queries as they are."""
         require_map(self)
         if querying.top is not None:
             check_candidates(querying.top, apart, self.map.places)
@@ -528,6 +536,7 @@ class DejaVu(nn.Module):
         if loops is not None:
             check_loops_along(self.map.layout)
         queries = self.at_map_size(queries, self.frame_shape or ())
+        check_maker(self.provenance.maker, "the map", queries)
         matching = self.matching(sequence, search) if loops is None else self.loop_matching(loops, sequence)
         self._searcher(matching)  # refuses what does not fit
         if sequence is not None:
@@ -557,12 +566,14 @@ class DejaVu(nn.Module):
         together = whole or loops is not None or headings > 1 or learns
         if not (together or (querying.centres(False) and not turned)):
             localizer = self.localizer(matching.as_it_drives())
-            batches = self.descriptor.batches(copies, progress, "localizing", on_first)
+            batches, done = self.descriptor.batches(copies, progress, "localizing", on_first), 0
             for rows in batches:
+                heard(rows[-done % querying.copies :: querying.copies])
+                done += len(rows)
                 match = localizer(set_apart(self.map, rows) if turned else rows)
                 yield match
             return
-        descriptors = self.described(queries, querying, centres, progress, on_first)
+        descriptors = self.described(queries, querying, centres, progress, on_first, heard)
         yield answer(self.scorer(descriptors, matching), matching, progress)
 
     def moved(self, queries: Traverse, asked: Drives, sequence: SequenceModel | None) -> Odometer | None:
@@ -595,11 +606,13 @@ class DejaVu(nn.Module):
         centre: bool = False,
         progress: bool = False,
         on_first: OnFirst | None = None,
+        heard: Callable[[Tensor], object] = id,
     ) -> Tensor:
         """Descriptors of all copies of queries, which lie as the map's frames: of turned ones by `set_apart`,
-        of others `centred`, if so."""
+        of others `centred`, if so. `heard` gets those of the queries as they are."""
         copies = querying.copies_of(queries, self.map.layout)
         rows = self.descriptor.all_of(copies, progress, on_first)
+        heard(rows[:: querying.copies])
         if is_turned(copies):
             return set_apart(self.map, rows)
         return centred(self.map, rows, querying.copies) if centre else rows
@@ -662,6 +675,20 @@ class DejaVu(nn.Module):
             return ALONE
         shown = self._shown(drive, views, self.centres(len(drive)))
         return shown if shown.known[0] != ALONE.shifts else ALONE
+
+    @torch.no_grad()
+    def taught_by(self, visit: Traverse | AugmentedFrames, places: Tensor | None = None) -> DejaVu:
+        """Keep digests of some frames of another visit, so that it is known if it is asked; not of drives
+        that show no place, of the `places` (Q,) of its frames."""
+        if hasattr(visit, "layout") and len(self.map.digest):  # copies of frames lie nowhere
+            each = parts_of(unmoved(cast(Traverse, visit)))
+            shown = (torch.zeros(sum(map(len, each))) if places is None else places).split([*map(len, each)])
+            for one, known in zip(each, shown, strict=True):
+                some = Part(one, range(0, len(one), -(-len(one) // PLACES)))
+                if (known >= 0).any() and self.descriptor.fits(self.map.dimension, some):
+                    digests = digests_of(self.descriptor.all_of(some), follow=False)
+                    self.provenance = self.provenance.taught_by(one.name, digests)
+        return self
 
     def look_at(self, visit: Traverse | AugmentedFrames) -> DejaVu:
         """Let single images be compared with the views that another visit, in order, shows to be of use."""
@@ -811,7 +838,8 @@ def _state_of(model: DejaVu, place_map: PlaceMap, traverse: Traverse | None) -> 
     along = len(shape) == 3 and learning.looks_along(place_map, model.descriptor, traverse)
     step = traverse.step if isinstance(traverse, ResampledTraverse) else None
     names = [*source_of(traverse).names]
-    return model_file.ModelState(shape, step, frame_names=names, views=ALONE if along else None)
+    state = model_file.ModelState(shape, step, frame_names=names, views=ALONE if along else None)
+    return replace(state, provenance=Provenance.of(traverse))
 
 
 def require_map(model: DejaVu, purpose: str = "") -> None:

@@ -41,6 +41,7 @@ from dejavu_torch.motion.odometry import GroundOdometry
 from dejavu_torch.periods.imposed import ImposedPeriods
 from dejavu_torch.periods.spectrogram import SpectrogramAnalysis
 from dejavu_torch.recognition.calibration import MARGIN, Calibration, Platt
+from dejavu_torch.recognition.provenance import Provenance
 from dejavu_torch.recognition.views import Views
 from dejavu_torch.text import one_line
 from dejavu_torch.types import Facts, InputError, Training, Traverse, expect
@@ -91,6 +92,7 @@ class ModelState:
         trained: how the features or the map were trained, if they were.
         frame_names: of the reference; empty if it has none.
         calibration: probabilities of right answers.
+        provenance: where the map comes from, by which queries that are not independent of it are known.
         views: of images alone, which other visits have shown; `ALONE` where moved images show other places of
             the route. None if nothing is known.
     """
@@ -101,6 +103,7 @@ class ModelState:
     frame_names: list[str] = field(default_factory=list)
     calibration: Calibration | None = None
     views: Views | None = None
+    provenance: Provenance = field(default_factory=Provenance)
 
 
 class Model(Protocol):
@@ -242,7 +245,8 @@ def state_to_json(state: ModelState) -> Facts:
     trained = state.trained and state.trained._asdict()
     values = {"frame_shape": state.frame_shape, "step": state.step, "trained": trained, "names": names}
     views = {"views": [*zip(*state.views.known, strict=True)]} if state.views is not None else {}
-    return values | {"calibration": calibration, **views}
+    provenance = {"provenance": stored} if (stored := state.provenance.stored()) else {}
+    return values | {"calibration": calibration, **views, **provenance}
 
 
 def state_from_json(values: Facts, frames: int | None = None) -> ModelState:
@@ -257,6 +261,7 @@ def state_from_json(values: Facts, frames: int | None = None) -> ModelState:
         [] if values["names"] is None else decode_names(values["names"], frames),
         calibration,
         (pairs := values.get("views")) and Views(*map(tuple, zip(*pairs, strict=True))),  # type: ignore[arg-type]
+        Provenance.restored(values.get("provenance", {})),
     )
 
 

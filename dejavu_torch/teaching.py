@@ -11,6 +11,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from dejavu_torch.data.maker import check_maker
 from dejavu_torch.data.moving import Moved
 from dejavu_torch.data.source import Source, as_traverse
 from dejavu_torch.data.traverse import chained
@@ -23,6 +24,7 @@ from dejavu_torch.model import DejaVu, check_queries, require_map
 from dejavu_torch.recognition.calibration import TOLERANCE, Calibration, calibrated_by_drive
 from dejavu_torch.recognition.centring import centred
 from dejavu_torch.recognition.evidence import spacing_of
+from dejavu_torch.recognition.provenance import check_independent
 from dejavu_torch.recognition.smoother import PlaceSmoother
 from dejavu_torch.types import InputError, Traverse, expect
 
@@ -153,7 +155,7 @@ def refine(model: DejaVu, drive: Source, progress: bool = False) -> Refinement:
     refined = refined_by(model, descriptors)
     refined.into(model)
     if refined.told.accepted:
-        model.look_at(traverse)
+        model.taught_by(traverse).look_at(traverse)
     return refined.told
 
 
@@ -165,6 +167,7 @@ def described(model: DejaVu, drive: Source, verb: str, progress: bool = False) -
     if not isinstance(place_map, SpectralMap):
         raise InputError(f"the map is of kind {place_map.kind!r}; expected one of kind 'spectral' to {verb}")
     traverse = model.resample(as_traverse(drive), model.step, progress, model.frame_shape)
+    check_maker(model.provenance.maker, "the map", traverse)
     expect(len(traverse) >= SHORTEST, f"at least {SHORTEST}", f"{traverse.name} has {len(traverse)} frames")
     features = model.descriptor.count_features(traverse)
     check_queries(model, traverse.frame_shape, features, traverse.name)
@@ -221,11 +224,12 @@ def calibrate_by(model: DejaVu, drive: Traverse, progress: bool = False) -> Labe
     if none is. Returns where they are."""
     descriptors = model.described(straightened(model, drive), progress=progress)
     descriptors = descriptors.float().to(model.map.device)
+    check_independent(model.map, drive, descriptors)
     places = place_drive(model, descriptors)
     if (places >= 0).any():
         scores = (model.map.scores(rows) for rows in descriptors.split(_at_once(model.map)))
         model.calibration = _calibration(model.map, in_its_light(model, descriptors), places, scores)
-        model.look_at(drive)
+        model.taught_by(drive, places).look_at(drive)
     placed = Placed(torch.zeros(len(places), dtype=torch.int64), {0: drive.name}, SURE, 1)
     return LabelledFrames(drive, places.cpu(), placed)
 

@@ -72,6 +72,7 @@ class Traverse(Dataset[Tensor], ABC):
         deep: whether its images have more than 8 bits a pixel.
         layout: where its frames lie, if they become the places of a map: along a route, or over an area.
         beyond: frames that `stop=` left out after the last.
+        maker: what made ready descriptors, as their file tells; "" if it does not.
         cut: of windows of one long image, its size, the window's, and their range; equal: the same places.
 
     Raises:
@@ -94,6 +95,7 @@ class Traverse(Dataset[Tensor], ABC):
     ordered: bool = False
     sized: bool = False
     beyond: int = 0
+    maker: str = ""
     cut: tuple[tuple[int, ...], range] | None = None
     _layout: Layout = ROUTE
 
@@ -206,10 +208,10 @@ class Coordinates(NamedTuple):
     frame: str = ""
     height: int = 2
 
-    def flat(self) -> Coordinates:
-        """Without heights."""
+    def upright(self) -> Tensor:
+        """The values with the height last, of three."""
         ground = [column for column in range(3) if column != self.height]
-        return self if self.values.shape[1] < 3 else self._replace(values=self.values[:, ground], height=2)
+        return self.values if self.values.shape[1] < 3 else self.values[:, [*ground, self.height]]
 
 
 class Odometer(NamedTuple):

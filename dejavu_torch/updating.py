@@ -117,6 +117,8 @@ def update(
     if not stretches:
         if refined:
             refined.into(model)
+            if refined.told.accepted:
+                model.taught_by(traverse)
         return Update(refinement, True, unknown=tuple(unknown))
     grown, links, names, shown = place_map, [*place_map.known_links], [], [model.frame_names]
     for first, last in stretches:
@@ -133,6 +135,7 @@ def update(
     grown, known = grown.linked(links), joined_names(shown, sizes)
     model.replace_map(grown)
     model.frame_names, model.calibration = known, calibration
+    model.taught_by(traverse)
     return Update(refinement, True, tuple(stretches), tuple(names), tuple(unknown))
 
 

@@ -75,9 +75,10 @@ def test_a_reach_other_than_that_of_the_map(tmp_path, capsys, caplog):
     capsys.readouterr()
     run("localize", out / "map.safetensors", AGAIN, "--out", tmp_path / "m.csv")
     assert "of being within 5 places" in capsys.readouterr().out
-    rows = np.random.default_rng(0).random((64, 8), np.float32)
+    random = np.random.default_rng(0)
+    rows = random.random((64, 8), np.float32)
     for name in "abc":
-        np.save(tmp_path / f"{name}.npy", rows + 0.01 * rows[::-1])
+        np.save(tmp_path / f"{name}.npy", rows + 0.1 * random.random((64, 8), np.float32))
     map = tmp_path / "d.safetensors"
     run("learn", tmp_path / "a.npy", "--map", map, "--calibration", tmp_path / "b.npy")
     for command in ("compare a.npy c.npy --map d.safetensors", "evaluate near/matches.csv"):

@@ -282,6 +282,11 @@ def run_info(map: Path, *, features: nn.Module | None = None, command: str) -> N
     if model.step is not None and model.velocity is not None:
         print(f"places are {model.step:.4g} pixels of ground apart")
         parts.append(model.velocity)
+    if len(model.frame_shape or ()) == 1:
+        made = model.provenance.maker or 'unknown; {"maker": ...} in the .json beside an .npy would tell'
+        say(f"these descriptors were made by: {made}")
+    if taught := model.provenance.taught:
+        say(f"taught by: {', '.join(dict(taught))}")
     for part in parts:
         if part in parts[: 2 + len(made_by)] or part.extra_repr():
             print(f"{type(part).__name__}: {part.extra_repr()}")

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import threading
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 
+import torch
 from torch import Tensor
 
 from dejavu_torch.cli import options
@@ -25,6 +26,7 @@ from dejavu_torch.data.output import check_output_file
 from dejavu_torch.data.source import check_not_read, open_source
 from dejavu_torch.data.traverse import Whole
 from dejavu_torch.evaluation.answers import describe_probable, next_steps, probable_counts
+from dejavu_torch.maps.digest import BYTES, digests_of
 from dejavu_torch.model import DejaVu
 from dejavu_torch.motion.ground_plane import check_corners
 from dejavu_torch.motion.resampling import source_of
@@ -91,7 +93,8 @@ def run_localize(
         matcher = querying.matcher(SUPPRESSION, acceptance.threshold, ordered)
     assert not isinstance(matcher, str)
     asked = replace(querying.by(matcher), ordered=ordered)
-    matches, chosen = _found(model, query, asked)
+    digests = [torch.zeros(0, BYTES, dtype=torch.uint8)]
+    matches, chosen = _found(model, query, asked, lambda rows: digests.append(digests_of(rows, follow=False)))
     counts, lost = Counter[str](), set[bool]()
 
     def counted() -> Iterator[Match]:
@@ -113,6 +116,9 @@ def run_localize(
         print(chosen)
     if querying.loops is None and any(lost):
         print(NO_DRIVE)
+    if querying.loops is None:
+        for doubt in model.provenance.doubts(model.map, torch.cat(digests), query):
+            say(str(doubt))
     if damaged:
         one, many = min(damaged), len(damaged)
         print(f"{many} frame{'s' * (many > 1)} could not be read, such as {one}: {damaged[one]}")
@@ -124,7 +130,9 @@ def run_localize(
     _print_evaluate(out, model, map, source if query.coordinates is not None else "SOURCE")
 
 
-def _found(model: DejaVu, query: Traverse, querying: Querying) -> tuple[Iterator[Match], Acceptance]:
+def _found(
+    model: DejaVu, query: Traverse, querying: Querying, heard: Callable[[Tensor], object]
+) -> tuple[Iterator[Match], Acceptance]:
     """The matches of a query, of which candidates follow each other, and how they are accepted."""
     matcher, loops, top = querying.matcher(), querying.loops, querying.top
     assert not isinstance(matcher, str)
@@ -135,7 +143,7 @@ def _found(model: DejaVu, query: Traverse, querying: Querying) -> tuple[Iterator
         centre = smooths or matcher is None
         centre &= querying.centres(querying.ordered and model.centres(len(query)))
         querying = replace(querying, centre="mean" if centre else "none")
-    matches = model.matches(query, querying, True, apart=SUPPRESSION)
+    matches = model.matches(query, querying, True, apart=SUPPRESSION, heard=heard)
     return matches if top is None else (part.map(Tensor.flatten) for part in matches), acceptance
 
 

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from dejavu_torch.data.files import read_text, reading
 from dejavu_torch.data.folder import ROUNDING, numbers_increase
+from dejavu_torch.data.maker import read_maker
 from dejavu_torch.text import printable
 from dejavu_torch.types import InputError, Traverse, expect
 
@@ -87,7 +88,8 @@ class ArrayTraverse(Traverse):
 def read_array(path: Path) -> ArrayTraverse:
     """An `.npy` file of frames or features, memory-mapped.
 
-    Features (N,D) take the names of their images from `X.txt` next to `X.npy`, one per line, if it exists.
+    Features (N,D) take the names of their images from `X.txt` next to `X.npy`, one per line, and what made
+    them from the entry "maker" of `X.json`, if these exist.
 
     Raises:
         InputError: not a complete .npy file, an array of another shape or type, or a wrong number of names.
@@ -95,7 +97,7 @@ def read_array(path: Path) -> ArrayTraverse:
     with reading(path, "is not a complete .npy array", EXPECTED):
         values = np.lib.format.open_memmap(path, mode="r")
         traverse = ArrayTraverse(values, printable(path))
-    traverse.path = path
+    traverse.path, traverse.maker = path, read_maker(path) if values.ndim == 2 else ""
     text = path.with_suffix(".txt")
     if values.ndim == 2 and text.exists():
         expected = f"{len(values)} names, one line for each row of {path}, or no such file"

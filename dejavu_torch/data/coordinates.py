@@ -65,9 +65,10 @@ class Fix(NamedTuple):
 
 
 def coordinates_of(traverses: Sequence[Traverse], kind: Kind) -> list[Tensor]:
-    """Coordinates of traverses in one frame, (N,2) or (N,3) float64 metres each, NaN for frames without. They
-    are those that the traverses carry, for "metres" and "pixels", if one does, else those in names. Degrees
-    are converted to the coordinate system of the other traverse, if it is that of a map.
+    """Coordinates of traverses in one frame, (N,2) or (N,3) float64 metres each, the height last, NaN for
+    frames without. They are those that the traverses carry, for "metres" and "pixels", if one does, else
+    those in names. Degrees are converted to the coordinate system of the other traverse, if it is that of a
+    map.
 
     Raises:
         InputError: as `named_coordinates` and `from_degrees`; some that carry none, or of different kinds
@@ -90,11 +91,14 @@ def coordinates_of(traverses: Sequence[Traverse], kind: Kind) -> list[Tensor]:
     frames = {own.frame: one.name for own, one in zip(known, traverses, strict=True) if own.frame}
     seen = " and ".join(f"coordinates of {name} in {frame}" for frame, name in frames.items())
     expect(len(frames) < 2, "one system for both, as by gdalwarp -t_srs", seen)
-    if len({own.values.shape[1] for own in known}) > 1:
-        flat = traverses[[own.values.shape[1] for own in known].index(2)].name
-        _warn_flat(flat)
-        known = [own.flat() for own in known]
-    return [own.values for own in known]
+    widths = [own.values.shape[1] for own in known]
+    if len({*widths}) > 1:
+        _warn_flat(traverses[widths.index(2)].name, "two numbers: the heights of the other visit are")
+    elif len({own.height for own in known}) > 1:
+        _warn_flat(traverses[0].name, "another axis for heights than the other visit: they are")
+    else:
+        return [own.upright() for own in known]
+    return [own.upright()[:, :2] for own in known]
 
 
 def read_coordinates(path: Path, traverse: Traverse) -> tuple[Coordinates, Tensor | None, Odometer | None]:
@@ -117,7 +121,7 @@ def read_coordinates(path: Path, traverse: Traverse) -> tuple[Coordinates, Tenso
     table = read_table(path, EXPECTED)
     expect(table.rows or table.header, EXPECTED, f"{path} has no rows")
     columns, degrees, height = _columns(table)
-    table = table.distinct() if "time" in table else table
+    table = table.distinct() if "time" in table and len(table) != len(traverse) else table
     turns = "heading" in table
     columns += [table.at("heading")] if turns else []
     table.check_width(max(columns) + 1)
@@ -131,7 +135,11 @@ def read_coordinates(path: Path, traverse: Traverse) -> tuple[Coordinates, Tenso
     lines = [table.rows[row][0] for row in order]
     values[order, :dimensions], seen = checked_fixes(values[order, :dimensions], degrees, lines)
     values = _of_frames(table, values, traverse)
-    odometer = read_odometer(table, traverse) if "moved" in table else None
+    odometer = None
+    try:
+        odometer = read_odometer(table, traverse) if "moved" in table else None
+    except InputError as error:
+        seen.append(f"the column moved is not used: {error}")
     if unused := table.unused():
         many, are = ("s", "are") if unused[1:] else ("", "is")
         seen.append(f"the column{many} {', '.join(unused)} {are} not used")
@@ -196,9 +204,9 @@ def _columns(table: Table) -> tuple[list[int], bool, int]:
     if pair is None or not table.rows:
         raise InputError(f"{table}; expected {EXPECTED}")
     degrees = pair[0] == "lat"
-    names = (*pair, "z") if not degrees and "z" in table else pair
-    if degrees and "z" in table:
-        table.at("z")  # heights of receivers are no better than tens of metres
+    # heights of receivers, of other names, are no better than tens of metres
+    height = "z" in table and (pair[0] == "x" or any(column.title == "z" for column in table.header))
+    names = (*pair, "z") if height and not degrees else pair
     return [table.at(name) for name in names], degrees, 2
 
 
@@ -215,27 +223,31 @@ def _of_frames(table: Table, values: np.ndarray, traverse: Traverse) -> np.ndarr
     """The rows (R,K) of the frames of a traverse, (N,K), NaN where there is none."""
     path, frames = table.path, len(traverse)
     none = np.full(values.shape[1], math.nan)
-    if "name" in table:
+    numbered = "frame" in table and not np.isnan(table.numbers("frame")).all()  # else of another frame
+    if "name" in table and (
+        any(traverse.names) or not ("time" in table or numbered or len(values) == frames)
+    ):
         rows: dict[str, int] = {}
         for row, name in enumerate(table.text("name")):
             seen = f"{table.where(row)}: {name} is there twice"
             fits = name not in rows or np.array_equal(values[rows[name]], values[row], equal_nan=True)
             expect(fits, f"the row of line {table.rows[rows.get(name, row)][0]} alone", seen)
             rows.setdefault(name, row)
-        for way in (str, _last, _stem):  # names of a file may have folders, or no suffix
+        # names of a file may have folders, or no suffix
+        for way, asked in (str, str), (_last, _last), (_last, _stem), (_stem, _stem):
             by = {way(name): row for name, row in rows.items()}
-            if len(by) == len(rows) and any(way(name) in by for name in traverse.names):
-                found = (by.get(way(name)) for name in traverse.names)
+            if len(by) == len(rows) and any(asked(name) in by for name in traverse.names):
+                found = (by.get(asked(name)) for name in traverse.names)
                 return np.array([none if row is None else values[row] for row in found])
         seen = f"{path} tells of no frame of {traverse.name}"
         raise InputError(f"{seen}; expected its names or times, such as {[*traverse.names, 'none'][0]}")
     taken = _times(table, traverse) if "time" in table else None
     if "time" in table and (taken is not None or len(values) != frames):
         times = table.numbers("time")
-        if "nsec" in table:
+        if "nsec" in table and not (times % 1).any():  # else they have the fractions
             times = times + 1e-9 * table.numbers("nsec")
         return _at_times(table, times, values, traverse.name, taken)
-    if "frame" in table and not ("time" in table and len(values) == frames):
+    if numbered and not ("time" in table and len(values) == frames):
         numbers = [whole(cell, "frame", 0, table.where(row)) for row, cell in enumerate(table.text("frame"))]
         beyond = [number for number in numbers if number >= frames]
         from_one = (
@@ -277,8 +289,10 @@ def _times(table: Table, traverse: Traverse) -> np.ndarray | None:
     known = named[~np.isnan(named)]
     if not len(known) or known.max() >= COUNTED or (known % 1).any():
         return named if len(known) else None
+    if np.isnan(times).all():
+        return None
     within = (known >= np.nanmin(times)) & (known <= np.nanmax(times))
-    return named if np.isnan(times).all() or within.mean() >= COVERED else None
+    return named if within.mean() >= COVERED else None
 
 
 def _range(times: np.ndarray) -> str:
@@ -391,8 +405,8 @@ def _warn_missing(source: str, missing: int, frames: int, example: str) -> None:
 
 
 @cache
-def _warn_flat(name: str) -> None:
-    log.warning("%s has coordinates of two numbers: the heights of the other visit are not compared", name)
+def _warn_flat(name: str, seen: str) -> None:
+    log.warning("%s has coordinates of %s not compared", name, seen)
 
 
 def _fix(name: str) -> Fix:

@@ -75,7 +75,7 @@ def read_rows(path: Path, expected: str) -> list[tuple[int, list[str]]]:
     cells = (line for line in lines if line[:1] != "#")
     separator = next((sign for line in cells for sign in ";\t," if sign in line), " ")
     if separator == " ":  # a unit stays with its name, as in "moved [m]"
-        lines = [re.sub(r" +(?=[\[(]\w+[\])])", "", line) for line in lines]
+        lines = [re.sub(r" +(?=[\[(]\w+[\])])", "", line.rstrip()) for line in lines]
     reader = csv.reader(lines, delimiter=separator, skipinitialspace=True)
     try:
         rows = [(reader.line_num, [cell.strip() for cell in row]) for row in reader]

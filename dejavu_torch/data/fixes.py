@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from itertools import pairwise
 
 import numpy as np
 import numpy.typing as npt
@@ -12,11 +11,12 @@ import numpy.typing as npt
 from dejavu_torch.text import rounded
 
 FAR, AWAY = 20, 50.0  # steps of the usual length, and metres, beyond which a fix is far from the next one
-RARE = 0.05  # share of fixes that may be far from their neighbours; beyond, frames are in no order
+RARE = 0.1  # share of fixes that may be far from their neighbours; beyond, frames are in no order
 JOINED = 2  # jumps that are told: more are drives that were joined, or a raster
 MOST = 20  # rows that leave the path together
 HELD, MADE_UP = 5, 3  # rows of a fix that is held, and steps of the usual length that make up for it
 ALIKE, LEAST = 0.8, 5  # share of runs of equal fixes that have about one length, and their least number
+AHEAD = 0.5  # cosine of the usual turn from a step to the next
 SLOWEST = 100  # rows between two changes of a fix
 PER_DEGREE = 111_200.0  # metres, of a meridian
 
@@ -66,9 +66,10 @@ def checked_fixes(values: Fixes, degrees: bool = False, lines: Sequence[int] = (
         seen.append(f"{fixes} {away} m off the path")
     values = _held(values, degrees, seen, lines)
     if 0 < len(jumps := _jumps(values, degrees)) <= JOINED:
-        row, away = np.flatnonzero(~np.isnan(values).any(1))[jumps[0]], _steps(values, degrees)[jumps[0]]
-        after = f"after line {lines[row]}, and does not come back"
-        seen.append(f"the path jumps {rounded(float(away))} m {after}")
+        row, *again = np.flatnonzero(~np.isnan(values).any(1))[jumps]
+        away = rounded(float(_steps(values, degrees)[jumps[0]]))
+        then = f"again after line {lines[again[0]]}" if again else "does not come back"
+        seen.append(f"the path jumps {away} m after line {lines[row]}, and {then}")
     return values, seen
 
 
@@ -127,16 +128,27 @@ def _astray(values: Fixes, degrees: bool) -> npt.NDArray[np.bool_]:
     # a jump before the first fix, and one after the last, as if the path went on there
     ends = [-1] * (jumps[0] < LEAST), [len(rows) - 1] * (jumps[-1] >= len(rows) - 1 - LEAST)
     jumps, alone = [*ends[0], *jumps, *ends[1]], len(jumps) == 1
-    for before, after in pairwise(jumps):
-        if before < 0 or after == len(rows) - 1:
-            goes_on = alone
-        else:
-            away = np.linalg.norm(at[after + 1] - at[before])
-            near = away <= limit + MADE_UP * usual * (after - before)
-            goes_on = after - before <= MOST and bool(near)
-        if goes_on and not off[rows[max(before, 0)]]:
-            off[rows[before + 1 : after + 1]] = True
+    for i, before in enumerate(jumps):
+        for after in jumps[i + 1 :]:
+            if off[rows[max(before, 0)]] or after - before > MOST:
+                break
+            if before < 0 or after == len(rows) - 1:
+                goes_on = alone
+            else:
+                away = np.linalg.norm(at[after + 1] - at[before])
+                goes_on = bool(away <= limit + MADE_UP * usual * (after - before))
+            off[rows[before + 1 : after + 1]] |= goes_on
+    if off.any():  # what is left may have an end that is off
+        off |= _astray(np.where(off[:, None], math.nan, values), degrees)
     return off
+
+
+def _straight(path: Fixes) -> bool:
+    """Whether most steps of a path (n,K) go on in about the direction of the one before, as no views do that
+    were taken here and there."""
+    steps = np.diff(path, axis=0)
+    lengths = np.linalg.norm(steps, axis=1)
+    return bool(np.median((steps[1:] * steps[:-1]).sum(1) / (lengths[1:] * lengths[:-1])) > AHEAD)
 
 
 def _held(values: Fixes, degrees: bool, seen: list[str], lines: Sequence[int]) -> Fixes:
@@ -148,17 +160,18 @@ def _held(values: Fixes, degrees: bool, seen: list[str], lines: Sequence[int]) -
     starts = np.concatenate([[0], np.flatnonzero((np.diff(own, axis=0) != 0).any(1)) + 1])
     lengths = np.diff(np.append(starts, len(own)))
     every = float(np.median(lengths[:-1])) if len(lengths) > 1 else 0.0
-    near = np.abs(lengths[1:-1] - every) <= max(1.0, every / 10)
-    if 2 <= every <= SLOWEST and len(lengths) > LEAST and near.mean() >= ALIKE:
-        between = np.arange(starts[-1] + 1)
+    near = np.abs(lengths[1:-1] - every) <= max(1.0, every / 4)
+    at = metres(own[starts], degrees)
+    if 2 <= every <= SLOWEST and len(lengths) > LEAST and near.mean() >= ALIKE and _straight(at):
+        stays = starts[1:][lengths[:-1] > 2 * every] - round(every)  # until then it stood
+        knots, between = np.sort(np.append(starts, stays)), known[: starts[-1] + 1]
         for column in own.T:
-            column[between] = np.interp(between, starts, column[starts])
+            column[: len(between)] = np.interp(between, known[knots], column[knots])
         values = values.copy()
         values[known] = own
         seen.append(f"fixes change every {every:g} lines; those between are interpolated")
         return values
     usual, held = _usual(values, degrees), np.zeros(len(values), dtype=bool)
-    at = metres(own[starts], degrees)
     after = np.append(np.linalg.norm(np.diff(at, axis=0), axis=1), 0.0)
     for start, length, step in zip(starts, lengths, after, strict=True):
         if length >= HELD and step > max(MADE_UP, length / MADE_UP) * usual:

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from dejavu_torch.data.files import reading
 from dejavu_torch.data.folder import numbers_increase, sort_names
+from dejavu_torch.data.maker import as_maker
 from dejavu_torch.memory import check_room
 from dejavu_torch.text import one_line, printable
 from dejavu_torch.types import InputError, Traverse, expect
@@ -30,6 +31,9 @@ class DescriptorFile(Traverse):
         path: a file with a group for each image, whose name may contain slashes, each with a dataset
             `global_descriptor` (D,) float; other datasets are ignored.
         order: as for `ImageFolder`.
+
+    Attributes:
+        maker: the attribute "maker" of the file, if it has one.
 
     Shape: batches (B,D) float32.
 
@@ -56,6 +60,7 @@ class DescriptorFile(Traverse):
         with self._open() as file:
             file.visititems(visit)
             shared = KEY in file
+            self.maker = as_maker(file.attrs.get("maker", ""), self.name)
             self.names = sort_names(shapes, order, self.name)
         seen = f"has one {KEY} for all images" if shared else f"contains no {KEY}"
         expect(shapes, EXPECTED, f"{self.name} {seen}")

@@ -141,7 +141,8 @@ def check_not_read(out: Path, *sources: str | Path | None) -> None:
         path, read = Path(address.removeprefix(kind)), False
         beside = [Path(file) for name, file in parse_qsl(query) if name in ("coordinates", "mask", "points")]
         with suppress(OSError, ValueError, RuntimeError):  # missing, not a valid path, or a link to itself
-            names = [path.with_suffix(".txt")] if path.suffix.lower() == ".npy" else []
+            named = [path.with_suffix(suffix) for suffix in (".txt", ".json")]
+            names = named if path.suffix.lower() == ".npy" else []
             read = any(out.resolve() == file.resolve() for file in (path, *names, *beside)) or out.samefile(
                 path
             )

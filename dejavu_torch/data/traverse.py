@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from dejavu_torch.data.files import LARGEST
+from dejavu_torch.data.maker import check_maker
 from dejavu_torch.resize import is_stretched, resize_frames
 from dejavu_torch.types import Coordinates, InputError, Traverse, expect
 
@@ -37,9 +38,9 @@ class Part(Traverse):
 
     def __init__(self, traverse: Traverse, frame: Tensor | range) -> None:
         self.traverse, self.frame, self.name = traverse, frame, traverse.name
-        self.sized, self.ordered = traverse.sized, traverse.ordered
+        self.sized, self.ordered, self.maker = traverse.sized, traverse.ordered, traverse.maker
         if isinstance(frame, range):
-            self.beyond = (len(traverse) + traverse.beyond - frame.stop) // frame.step
+            self.beyond = len(range(frame.start, len(traverse) + traverse.beyond, frame.step)) - len(frame)
         self.times, self.places, self.headings = (
             None if values is None else values[torch.as_tensor(frame)]
             for values in (traverse.times, traverse.places, traverse.headings)
@@ -119,6 +120,9 @@ class Chain(Traverse):
         self.name = " + ".join(traverse.name for traverse in self.traverses)
         self.sized = any(traverse.sized for traverse in self.traverses)
         self.ordered = all(traverse.ordered for traverse in self.traverses)
+        for other in self.traverses:
+            check_maker(first.maker, first.name, other)
+        self.maker = first.maker if all(traverse.maker for traverse in self.traverses) else ""
         self.starts = list(accumulate(map(len, self.traverses), initial=0))
         for name in ("times", "headings"):
             each = [getattr(traverse, name) for traverse in self.traverses]

@@ -22,7 +22,6 @@ from dejavu_torch.types import InputError, Traverse, expect
 log = logging.getLogger("dejavu_torch")
 
 FEW, PART = 10, 5  # queries, and parts of a visit of which a file tells one, that look like seconds
-FEW, PART = 10, 5  # queries, and parts of a visit of which a file tells one, that look like seconds
 Listed = dict[int, list[float]]  # the places of each query in a file
 
 

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from dejavu_torch.data.coordinates import Near
-from dejavu_torch.evaluation.answers import OVER_CHANCE, confident
+from dejavu_torch.evaluation.answers import MIN_WIDTH, OVER_CHANCE, confident
 from dejavu_torch.text import rounded
 from dejavu_torch.types import Doubt, Match
 
@@ -21,9 +21,11 @@ SPREADS = 3.0  # of what is left, by which its mean is beyond chance
 AS_WELL = 0.02  # share of the answers by which a simpler relation may explain fewer
 PAIRS, SOME = 2000, 500  # of answers that propose a relation; answers that judge it
 STEEPEST, SIMPLE = 30.0, 12  # places a query; whole slopes that are tried
-AT_ENDS = 0.05  # share of the answers that a shift in time may leave without coordinates
+NEARLY = 0.05  # by which the share that a way explains may be below that of the best, to be named
+OVERLAP = 0.4  # share of the answers that a relation has to explain, where others lack coordinates
 CHANGES = 5  # of a value that was rounded
 FLOOR, FEW = 2.0, 1500  # metres that a floor is above another, at least; places that are looked at
+BETTER = 3  # times as many answers as the truth that a relation makes right within the tolerance
 RUN = 15  # consecutive answers whose median tells an offset that changes
 GROWN = 0.5  # of the queries, by which an offset may grow
 STRAY = 1.2  # of the way from its first value to its last, that such an offset may take
@@ -46,6 +48,10 @@ class Relation(NamedTuple):
     def explains(self) -> bool:
         return self.answers >= EXPLAINED * self.confident
 
+    def at(self, queries: Tensor) -> Tensor:
+        """The places of queries, by a slope and an offset."""
+        return (self.slope * queries + self.offset).round().long()
+
     def __str__(self) -> str:
         if self.last is not None:
             sign = "query" if self.slope > 0 else "- query"
@@ -58,11 +64,12 @@ class Relation(NamedTuple):
 
 
 class Ground(NamedTuple):
-    """Coordinates that a truth compares, in one frame, (...,2) or (...,3) float64, NaN where unknown.
+    """Coordinates that a truth compares, in one frame, (...,2) or, with heights, (...,3) float64, NaN where
+    unknown.
 
     found: (Q,K) of the answers. asked: (Q,K) of the queries. stored: (N,K) of all reference frames, own:
     (F,K) of all frames of the query's source; names: of both. second: mean seconds between the latter, None
-    if unknown. height: the column of heights, of three.
+    if unknown.
     """
 
     near: Near
@@ -72,7 +79,6 @@ class Ground(NamedTuple):
     own: Tensor
     names: tuple[str, str]
     second: float | None = None
-    height: int = 2
 
 
 def coarse(ground: Ground) -> list[Doubt]:
@@ -84,7 +90,7 @@ def coarse(ground: Ground) -> list[Doubt]:
             if (size := _rounded_to(known, axis)) > radius / 2:
                 seen = f"the {title} of {name} are multiples of {rounded(size)} {unit}"
                 doubts.append(Doubt("digits", f"{seen}, too coarse for a distance of {radius:g} {unit}"))
-    floors = _floors(torch.cat([ground.stored, ground.own]), ground.height, radius)
+    floors = _floors(torch.cat([ground.stored, ground.own]), radius)
     if floors:
         seen = f"places lie {rounded(floors)} {unit} above others, all within {radius:g} {unit} of a query"
         expected = f"--truth {ground.near.kind}:{floors / 2:.2g}"
@@ -109,15 +115,14 @@ def _rounded_to(path: Tensor, axis: int) -> float:
     return size if even[0] and rounded_off and not goes_on else 0.0
 
 
-def _floors(places: Tensor, height: int, radius: float) -> float:
+def _floors(places: Tensor, radius: float) -> float:
     """How far floors lie above each other, if some lie within a radius; else 0."""
     places = places[places.isfinite().all(1)]
     if places.shape[1] < 3 or len(places) < LEAST:
         return 0.0
     some = places[torch.linspace(0, len(places) - 1, min(FEW, len(places))).round().long()]
-    ground = [axis for axis in range(3) if axis != height]
-    near = torch.cdist(some[:, ground], some[:, ground]) <= min(radius / 5, FLOOR)
-    above = (some[:, None, height] - some[None, :, height]).abs()[near]
+    near = torch.cdist(some[:, :2], some[:, :2]) <= min(radius / 5, FLOOR)
+    above = (some[:, None, 2] - some[None, :, 2]).abs()[near]
     higher = above[above >= FLOOR]
     if len(higher) < LEAST or (gap := float(higher.median())) > radius:
         return 0.0
@@ -128,16 +133,21 @@ def _floors(places: Tensor, height: int, radius: float) -> float:
 
 class Judged(NamedTuple):
     """Answers that a truth judges, in frames of the sources: (Q,) each, but for `alone`, places that single
-    images report, which speak for a drive or against it; None if they are the answers. within: frames."""
+    images report, which speak for a drive or against it; None if they are the answers. tolerance: frames."""
 
     match: Match
     queries: Tensor
     right: Tensor
     judged: Tensor
-    within: int
+    tolerance: int
     truth: str
     places: int | None = None
     alone: Tensor | None = None
+
+    @property
+    def within(self) -> int:
+        """Frames to each side of a relation."""
+        return max(self.tolerance, MIN_WIDTH)
 
     def sure(self) -> Tensor:
         """Numbers of the answers that are believed; none unless they are many, of many places."""
@@ -164,14 +174,15 @@ def contradictions(asked: Judged, ground: Ground | None = None) -> list[Doubt]:
     if not len(numbers):
         return []
     rejected = float((~asked.right[numbers]).double().mean()) > REJECTED
-    if ground is None:
-        relation = (
-            relation_of(asked.match.index[numbers], asked.queries[numbers], asked.within)
-            if rejected
-            else None
-        )
-        return [] if relation is None or not relation.explains else [_of_frames(relation, asked)]
-    return _of_coordinates(asked, numbers, ground, rejected)
+    if ground is not None:
+        return _of_coordinates(asked, numbers, ground, rejected)
+    places, queries = asked.match.index[numbers], asked.queries[numbers]
+    relation = relation_of(places, queries, asked.within) if rejected else None
+    if relation is None or not relation.explains:
+        return []
+    near = (places - relation.at(queries)).abs() <= asked.tolerance  # else a small tolerance rejects them
+    better = relation.last is not None or int(near.sum()) >= BETTER * int(asked.right[numbers].sum())
+    return [_of_frames(relation, asked)] if better else []
 
 
 def relation_of(places: Tensor, queries: Tensor, within: int) -> Relation | None:
@@ -235,6 +246,8 @@ def _growing(x: Tensor, y: Tensor, within: int) -> Relation | None:
         middle = torch.cat([runs[:1].expand(RUN // 2), runs, runs[-1:].expand(len(x) - len(runs) - RUN // 2)])
         near = int(((offset - middle).abs() <= within).sum())
         way = float((runs[-1] - runs[0]).abs())
+        if float((x + slope * middle).diff().min()) < -within:  # back to places that were passed
+            continue
         if near >= EXPLAINED * len(x) and float(steps) <= STRAY * way + within and within < way <= most:
             return Relation(slope, float(runs[0]), near, len(x), float(runs[-1]))
     return None
@@ -244,8 +257,10 @@ def _of_frames(relation: Relation, asked: Judged) -> Doubt:
     """A relation between numbers of frames in words, with what would make the truth agree."""
     many = f"{relation.answers} of {relation.confident} confident answers"
     text = f"the answers contradict the truth ({asked.truth}): {many} follow {relation}"
-    first, last = int(asked.queries.min()), int(asked.queries.max())
-    ends = [f"{query},{max(0, round(relation.slope * query + relation.offset))}" for query in (first, last)]
+    at = relation.at(asked.queries)
+    there = asked.queries[(at >= 0) & (at < (asked.places or at.max() + 1))]
+    first, last = int(there.min()), int(there.max())
+    ends = [f"{query},{int(relation.at(there.new_tensor(query)))}" for query in (first, last)]
     in_file = f"--interpolate and --truth FILE.csv with the lines {ends[0]} and {ends[1]}"
     if relation.last is not None:
         what = "frames are missing, or their rates differ; pair frames by name or time in a --truth FILE.csv"
@@ -275,7 +290,7 @@ class Motion(NamedTuple):
         exchanged = self.mirrored and abs(angle - 90) < TURN
         parts = {
             "with x and y exchanged": exchanged,
-            "mirrored": self.mirrored and not exchanged,
+            "mirrored (y negated)": self.mirrored and not exchanged,
             f"turned by {angle:.1f} degrees": abs(angle) >= TURN and not exchanged,
             f"scaled by {size:.4g}": abs(size - 1) >= STRETCH,
             _vector(self.move.real, self.move.imag): abs(self.move) >= 0.05,
@@ -326,40 +341,61 @@ def _of_coordinates(asked: Judged, numbers: Tensor, ground: Ground, rejected: bo
     away, spread = float(middle.norm()), float((left - middle).norm(dim=1).median())
     moved = f"{_vector(*middle.tolist())} {unit}"
     if not rejected:
-        if away > max(SPREADS * spread, radius / 2):
-            seen = (
-                f"the confident answers lie {rounded(away)} {unit} from the coordinates of their queries, in"
-            )
-            seen = f"{seen} one direction, with a spread of {rounded(spread)} {unit}"
+        if away > max(SPREADS * spread, radius / 2, _step(ground.stored)):  # of answers between two places
+            seen = f"the confident answers lie {rounded(away)} {unit} from the coordinates of their queries"
+            seen = f"{seen}, in one direction, with a spread of {rounded(spread)} {unit}"
             return [Doubt("shift", f"{seen}: they agree if those of {ground.names[1]} are {moved}")]
         return []
-    ways: list[tuple[int, str, str]] = []  # answers that each explains, its kind, and words
-    if (near := int(((left - middle).norm(dim=1) <= radius).sum())) >= EXPLAINED * len(found):
-        ways.append((near, "shift", moved))
-    for relation in _rows(found, queries, ground):
-        if relation.explains:
-            ways.append((relation.answers, "clock", _clock(relation, ground)))
-    if not ways:
+    ways: list[tuple[Explained, str, str]] = []  # with their kinds, and in words
+    near, right = (left - middle).norm(dim=1) <= radius, asked.right[numbers][known]
+    every = torch.ones_like(near)
+    some = torch.linspace(0, len(found) - 1, min(SOME, len(found))).round().long()
+    by_chance = (torch.cdist(found[some] - middle, own[some]) <= radius).double().mean()
+    if float(near.double().mean()) >= OVER_CHANCE * float(by_chance):
+        ways.append((Explained.of(near, every, right), "shift", moved))
+    exchanged = _exchanged(asked.match.index[numbers][known], queries, ground)
+    ways.append((Explained.of(*exchanged, right), "exchanged", "with the two files exchanged"))
+    ways += [(some, "clock", words) for some, words in _rows(found, queries, right, ground)]
+    if not any(some.holds and some.answers >= EXPLAINED * len(found) for some, *_ in ways):
         for mirrored in (False, True):
-            motion = motion_of(found, own, radius, mirrored)
-            if motion is not None and int(motion.near.sum()) >= EXPLAINED * len(found):
+            if (motion := motion_of(found, own, radius, mirrored)) is not None:
                 own_frames = all(_at_origin(table) for table in (ground.stored, ground.own))
                 both = ", as both begin at 0, 0" * own_frames
-                ways.append((int(motion.near.sum()), "frame", f"{motion}{both}"))
-    exchanged = _exchanged(asked.match.index[numbers], asked.queries[numbers], ground, radius)
-    if exchanged >= EXPLAINED * len(numbers):
-        ways.append((exchanged, "exchanged", "with the two files exchanged"))
+                ways.append((Explained.of(motion.near, every, right), "frame", f"{motion}{both}"))
+    best = max((some.share for some, *_ in ways if some.holds), default=0.0)
+    ways = [way for way in ways if way[0].holds and way[0].share >= best - NEARLY]
     if not ways:
         return []
-    best = max(ways)[0]
-    words = [(kind, way) for count, kind, way in ways if count >= best - AT_ENDS * len(found)]
-    many = f"{best} of {len(numbers)} confident answers agree with the coordinates of {ground.names[1]}"
-    text = f"the answers contradict the truth ({asked.truth}): {many} {', or '.join(way for _, way in words)}"
-    return [Doubt(words[0][0], text)]
+    # a move or a late clock supposes less than a turn or another rate
+    ways.sort(key=lambda way: (way[1] == "frame" or "run" in way[2], -way[0].answers))
+    (first, kind, _), words = ways[0], ", or ".join(way for *_, way in ways)
+    many = f"{first.answers} of {len(numbers)} confident answers agree with the coordinates of"
+    return [
+        Doubt(kind, f"the answers contradict the truth ({asked.truth}): {many} {ground.names[1]} {words}")
+    ]
 
 
-def _rows(found: Tensor, queries: Tensor, ground: Ground) -> Iterator[Relation]:
-    """How numbers of queries are related to the frames whose coordinates are those of the answers."""
+class Explained(NamedTuple):
+    """The share of the answers of which a relation tells something that it makes right, their number, and
+    whether that explains what the truth rejects: nine in ten, of many, while the truth rejects the others."""
+
+    share: float
+    answers: int
+    holds: bool
+
+    @classmethod
+    def of(cls, agree: Tensor, told: Tensor, right: Tensor) -> Explained:
+        """Of answers (n,) bool that agree, those of which something is told, and those that are right."""
+        answers, others = int((agree & told).sum()), right[~told]
+        share = answers / max(1, int(told.sum()))
+        wrong = not len(others) or float(others.double().mean()) <= REJECTED
+        many = answers >= max(LEAST, OVERLAP * len(told))
+        return cls(share, answers, share >= EXPLAINED and many and wrong)
+
+
+def _rows(found: Tensor, queries: Tensor, right: Tensor, ground: Ground) -> Iterator[tuple[Explained, str]]:
+    """How numbers of queries are related to the frames whose coordinates are those of the answers, in words,
+    and what that explains: a difference of clocks, else another relation."""
     own = ground.own[:, :2]
     rows = own.isfinite().all(1).nonzero()[:, 0]
     if len(rows) < LEAST:
@@ -368,32 +404,65 @@ def _rows(found: Tensor, queries: Tensor, ground: Ground) -> Iterator[Relation]:
     near = torch.cat(distance) <= ground.near.radius
     if near.sum() < LEAST:
         return
-    at, step = rows[torch.cat(nearest)], own[rows].diff(dim=0).norm(dim=1)
-    usual = float(step[step > 0].median()) if (step > 0).any() else 1.0
-    within = max(1, math.ceil(ground.near.radius / max(usual, 1e-9)))
-    relation = relation_of(at[near], queries[near], min(within, len(rows) // 10))
-    if relation is not None and not (relation.slope == 1 and relation.last is None and relation.offset == 0):
-        yield relation._replace(confident=len(found))
+    at, usual = rows[torch.cat(nearest)], _step(own[rows]) or 1.0
+    within, limit = max(1, math.ceil(ground.near.radius / usual)), max(ground.near.radius, usual)
+
+    def away(row: Tensor, some: Tensor) -> tuple[Tensor, Tensor]:
+        """How far the coordinates of frames lie from those of the answers, and whether both are known."""
+        there = own[row.round().long().clamp(0, len(own) - 1)]
+        told = (row >= 0) & (row < len(own)) & there.isfinite().all(-1)
+        return (there - found[some]).norm(dim=-1), told
+
+    every = torch.arange(len(found))
+    some = every[torch.linspace(0, len(every) - 1, min(SOME, len(every))).round().long()]
+    late = (at - queries)[near].unique()
+    late = late[torch.linspace(0, len(late) - 1, min(SOME, len(late))).round().long()]
+    apart, told = away(queries[some] + late[:, None], some)
+    best = int(torch.where(told, apart, limit).clamp(max=limit).sum(1).argmin())
+    relations = (
+        Relation(1.0, float(late[best]), 0, 0),
+        relation_of(at[near], queries[near], min(within, len(rows) // 10)),
+    )
+    for relation in filter(None, relations):
+        apart, told = away(relation.slope * queries + relation.offset, every)
+        if relation.last is not None:
+            apart, told = torch.cat(distance), torch.ones_like(told)
+        explained = Explained.of(apart <= limit, told, right)
+        if explained.holds:
+            if relation.slope != 1 or relation.offset or relation.last is not None:
+                yield explained, _clock(relation, ground)
+            return
 
 
 def _clock(relation: Relation, ground: Ground) -> str:
     """A relation between queries and the frames whose coordinates they should have, in words."""
     if relation.last is not None:
-        return f"if its rows are {round(-relation.offset)} to {round(-relation.last)} frames later"
+        sign, later = (1, "earlier") if relation.offset + relation.last > 0 else (-1, "later")
+        ends = " to ".join(str(round(sign * one)) for one in (relation.offset, relation.last))
+        return f"if its rows are {ends} frames {later}"
     rate = f"{abs(relation.slope):.4g} times as fast" * (abs(relation.slope) != 1)
     if how := " and ".join(filter(None, ["backwards" * (relation.slope < 0), rate])):
         return f"if its rows run {how}"
     later = "earlier" if relation.offset > 0 else "later"
     if ground.second is None:
-        return f"{abs(relation.offset):.0f} frames {later}"
+        return f"if its rows are {abs(relation.offset):.0f} frames {later}"
     return f"if its times are {abs(relation.offset) * ground.second:.1f} s {later}"
 
 
-def _exchanged(places: Tensor, queries: Tensor, ground: Ground, radius: float) -> int:
-    """How many answers are right if the reference has the coordinates of the query, and the reverse."""
-    fits = (places < len(ground.own)) & (queries < len(ground.stored))
-    one, other = ground.own[places[fits]], ground.stored[queries[fits]]
-    return int(((one - other).norm(dim=1) <= radius).sum())
+def _exchanged(places: Tensor, queries: Tensor, ground: Ground) -> tuple[Tensor, Tensor]:
+    """Which answers are right if the reference has the coordinates of the query, and the reverse; and of
+    which that can be told, (n,) bool."""
+    one, other = (
+        table[at.clamp(max=len(table) - 1)] for table, at in ((ground.own, places), (ground.stored, queries))
+    )
+    told = (places < len(ground.own)) & (queries < len(ground.stored)) & (one - other).isfinite().all(1)
+    return (one - other).norm(dim=1) <= ground.near.radius, told
+
+
+def _step(path: Tensor) -> float:
+    """The usual step from one known place of a path (n,K) to the next; 0 if there is none."""
+    steps = path[:, :2].diff(dim=0).norm(dim=1)
+    return float(steps[steps > 0].median()) if (steps > 0).any() else 0.0
 
 
 def _at_origin(table: Tensor) -> bool:
@@ -402,4 +471,4 @@ def _at_origin(table: Tensor) -> bool:
 
 
 def _vector(x: float, y: float) -> str:
-    return f"moved by ({x:.1f}, {y:.1f})"
+    return f"moved by ({round(x, 1) + 0.0}, {round(y, 1) + 0.0})"  # never -0.0

@@ -10,8 +10,9 @@ from torch import Tensor
 from dejavu_torch.data.coordinates import Near, coordinates_of
 from dejavu_torch.data.ground_truth import Truth, check_ground_truth, scored_and_right
 from dejavu_torch.evaluation.agreement import Ground, Judged, coarse, contradictions
-from dejavu_torch.evaluation.answers import MIN_WIDTH, describe_line
+from dejavu_torch.evaluation.answers import describe_line
 from dejavu_torch.evaluation.localization import Localization
+from dejavu_torch.maps.digest import digests_of
 from dejavu_torch.motion.resampling import source_of
 from dejavu_torch.types import Doubt, Facts, Match, Traverse
 
@@ -20,13 +21,22 @@ CONTRADICT = "the answers contradict the truth"
 
 def doubts_of(run: Localization, truth: Truth | None, facts: Mapping[str, Any]) -> list[Doubt]:
     """What is doubtful about a run with its answers, of which `facts` tell a line or shift."""
-    if run.truth is None or run.querying.loops is not None:
+    if run.querying.loops is not None:
+        return []
+    asked = run.query_features if run.causal_features is None else run.causal_features
+    digests = digests_of(asked[:: run.querying.copies], follow=False)
+    return _judged(run, truth, facts) + run.model.provenance.doubts(run.model.map, digests, run.query)
+
+
+def _judged(run: Localization, truth: Truth | None, facts: Mapping[str, Any]) -> list[Doubt]:
+    """What makes its answers agree with the truth."""
+    if run.truth is None:
         return []
     place_map = run.model.map
     match, alone = (one.renumbered(place_map.frame_of) for one in (run.match, run.judged))
     scored, right = scored_and_right(run.scored.index, run.truth, run.tolerance)
-    places, within = len(source_of(run.reference)), max(run.tolerance, MIN_WIDTH)
-    asked = Judged(match, run.query_frames, right, scored, within, facts["truth"], places)
+    places, tolerance = len(source_of(run.reference)), run.tolerance
+    asked = Judged(match, run.query_frames, right, scored, tolerance, facts["truth"], places)
     if run.answers == "drive":
         asked = asked._replace(alone=alone.index)
     ground = ground_of(truth, source_of(run.reference), source_of(run.query), match, run.query_frames)
@@ -43,8 +53,7 @@ def ground_of(
     stored, own = coordinates_of([reference, query], near.kind)
     names, times = (reference.name, query.name), query.times
     second = None if times is None or len(times) < 2 else float(times[-1] - times[0]) / (len(times) - 1)
-    height = 2 if reference.coordinates is None else reference.coordinates.height
-    return Ground(near, stored[match.index], own[queries], stored, own, names, second, height)
+    return Ground(near, stored[match.index], own[queries], stored, own, names, second)
 
 
 def compared(asked: Judged, ground: Ground | None, facts: Mapping[str, Any]) -> list[Doubt]:

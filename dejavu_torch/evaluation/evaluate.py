@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
@@ -27,9 +28,10 @@ from dejavu_torch.data.ground_truth import (
     offset_of,
     scored_and_right,
 )
+from dejavu_torch.data.traverse import Part
 from dejavu_torch.evaluation import curves
 from dejavu_torch.evaluation.agreement import Judged
-from dejavu_torch.evaluation.answers import MIN_WIDTH, answer_facts, shift_facts
+from dejavu_torch.evaluation.answers import answer_facts, shift_facts
 from dejavu_torch.evaluation.contenders import contend
 from dejavu_torch.evaluation.doubts import compared, doubt_facts, ground_of
 from dejavu_torch.evaluation.match_plots import draw_coverage
@@ -39,18 +41,21 @@ from dejavu_torch.evaluation.plots import Pictures
 from dejavu_torch.evaluation.rejection import draw_reliability, reach_of, rejection_facts
 from dejavu_torch.evaluation.report import Report
 from dejavu_torch.evaluation.score_plots import draw_curves
+from dejavu_torch.maps.digest import digests_of
 from dejavu_torch.maps.place_map import PlaceMap
 from dejavu_torch.maps.spectral_map import SpectralMap
+from dejavu_torch.model import DejaVu
 from dejavu_torch.model_file import read_place_map
 from dejavu_torch.places.layout import ROUTE, Layout
 from dejavu_torch.places.positions import unit_of
 from dejavu_torch.recognition.calibration import TOLERANCE
 from dejavu_torch.recognition.evidence import passed_of
 from dejavu_torch.text import plain_number, printable
-from dejavu_torch.types import Coordinates, Facts, InputError, Match, Traverse, expect
+from dejavu_torch.types import Coordinates, Doubt, Facts, InputError, Match, Traverse, expect
 from dejavu_torch.version import __version__
 
 RANKS = (5, 10)  # the N of recall@N
+DESCRIBED = 64  # places by whose queries these are compared with a map, at most
 TOLD = 10  # least number of right and of wrong answers whose scores are compared
 
 log = logging.getLogger("dejavu_torch")
@@ -98,6 +103,24 @@ class Asked:
             own = reference.layout.same(layout)
             expect(own, "that of the map, or no reference", f"{reference.name} is not the area of {self.map}")
         return place_map, reference, layout if reference is None else reference.layout
+
+    def doubts(self, place_map: PlaceMap | None, queries: Tensor, found: Tensor) -> list[Doubt]:
+        """Whether queries (Q,), with places (Q,), are independent of the map, by some that show places with a
+        digest, and those beside them; nothing without their source, or if the map cannot describe them."""
+        if self.map is None or self.query is None or place_map is None:
+            return []
+        with suppress(InputError):
+            model, count = DejaVu.load(self.map), len(self.query)
+            expect(model.step is None, "frames as they are")
+            off = (found - place_map.digested[:, None]).abs()
+            shown = off.argmin(1)[off.amin(1) <= 1] if off.numel() else found[:0]
+            shown = queries[shown[:: -(-len(shown) // DESCRIBED) or 1]]
+            frames = (shown[:, None] + torch.arange(-1, 2)).clamp(0, count - 1).unique()
+            some = Part(model.at_map_size(self.query, model.frame_shape or ()), frames)
+            rows = model.descriptor.all_of(some) if len(frames) else torch.zeros(0, model.map.dimension)
+            digests = digests_of(rows, follow=False)
+            return model.provenance.doubts(place_map, digests, self.query)
+        return []
 
     def _map(self, map: Path) -> PlaceMap:
         place_map = read_place_map(map)
@@ -172,13 +195,15 @@ def evaluate_file(
     facts = evaluation_facts(match, candidates, known, tolerance, positions, described) | alone
     if near is not None and layout.units:
         facts |= {"tolerance": plain_number(near.radius), "unit": layout.units}
+    doubts: list[Doubt] = []
     if loops is None:
         found = here if place_map is None else here.renumbered(place_map.frame_of)
         ground = ground_of(truth, reference, query, found, queries)
         facts |= {} if ground is None else shift_facts(ground.near, here, ground.found, ground.asked)
         judged, right = scored_and_right(match.index, known, tolerance)
-        one = Judged(found, queries, right, judged, max(tolerance, MIN_WIDTH), described, places)
-        facts |= doubt_facts(compared(one, ground, facts))
+        one = Judged(found, queries, right, judged, tolerance, described, frames)
+        doubts = compared(one, ground, facts) + asked.doubts(place_map, queries, here.index)
+    facts |= doubt_facts(doubts)
     accepted = facts["accepted"]
     facts["accepted_precision"] = facts["accepted_right"] / accepted if accepted else None
     facts |= {"matches": str(matches), "places": places}

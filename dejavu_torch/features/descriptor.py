@@ -10,6 +10,7 @@ from typing import cast
 import torch
 from torch import Tensor, nn
 
+from dejavu_torch.data.maker import check_maker
 from dejavu_torch.data.moving import Moved
 from dejavu_torch.data.traverse import Part
 from dejavu_torch.features.distilled import Distilled
@@ -472,6 +473,8 @@ class Descriptor(nn.Module):
 
     def check_sizes(self, reference: Traverse, *queries: Traverse) -> int:
         """The number of features per frame; refuses queries in which it differs before any long work."""
+        for query in queries:
+            check_maker(reference.maker, reference.name, query)
         counts = [self.count_features(traverse) for traverse in (reference, *queries)]
         for query, count in zip(queries, counts[1:], strict=True):
             if count != counts[0]:

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor, nn
 from typing_extensions import Self
 
+from dejavu_torch.maps.digest import BYTES
 from dejavu_torch.maps.summary import MapSummary
 from dejavu_torch.places.frame_table import FrameTable, Route
 from dejavu_torch.places.layout import ROUTE, Layout
@@ -48,6 +49,8 @@ class PlaceMap(nn.Module, ABC):
         positions: (F,) float32, even steps of each reference frame from the first place of its route, if
             resampled (section IV-B); (0,) if place i is reference frame i.
         visits: (V,2) int32, runs of places and the number of visits that they average; (0,2) if all are 1.
+        digest: (n,9) uint8, of the descriptors of some places, see `digests_of`; (0,9) if unknown. digested:
+            (n,) int64, these places.
         layout: where the places lie, stored with the map: along a route, several, or over an area. area: the
             same, None along routes. routes: of a merged map, in order, else (). Places and frames are
             numbered through all of them.
@@ -64,12 +67,15 @@ class PlaceMap(nn.Module, ABC):
     _layout: Layout = ROUTE
     positions: Tensor
     visits: Tensor
+    digest: Tensor
 
     def __init__(self, places: int = 0, dimension: int = 0) -> None:
         super().__init__()
         self.places, self.dimension = places, dimension
         self.register_buffer("positions", torch.zeros(0).float())
         self.register_buffer("visits", torch.zeros(0, 2, dtype=torch.int32), persistent=False)
+        self.register_buffer("digest", torch.zeros(0, BYTES, dtype=torch.uint8), persistent=False)
+        self.digested = torch.zeros(0, dtype=torch.int64)
 
     @abstractmethod
     def scores(self, queries: Tensor) -> Tensor:
@@ -82,6 +88,9 @@ class PlaceMap(nn.Module, ABC):
     @abstractmethod
     def summary(self) -> MapSummary:
         """Capacity of the map, and its bytes by part."""
+
+    def know(self, descriptors: Tensor) -> None:
+        """Keep the digest of the descriptors (N,K) of all places, if this kind of map does."""
 
     def loaded(self) -> None:
         """Called after a state was loaded, to derive attributes from the buffers."""

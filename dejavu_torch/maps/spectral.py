@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from dejavu_torch.maps.codec import encode
+from dejavu_torch.maps.digest import Digest, digests_of
 from dejavu_torch.maps.place_map import Mapper
 from dejavu_torch.maps.quantisation import RouteLines
 from dejavu_torch.maps.spectral_map import CHUNK_BYTES, Chunk, SpectralMap, SpectralMetric
@@ -167,7 +168,8 @@ def encode_chunk(
     check_descriptors(descriptors, len(mean))
     size = len(descriptors) // columns, columns
     (levels,) = RouteLines(descriptors, [size], transform, resolution, mean).levels(step)
-    return Chunk(len(descriptors), step, encode(levels), unseen(descriptors), columns)
+    digest = Digest(torch.arange(len(descriptors)), digests_of(descriptors))
+    return Chunk(len(descriptors), step, encode(levels), unseen(descriptors), columns, digest)
 
 
 def unseen(descriptors: Tensor) -> tuple[int, ...]:

@@ -9,13 +9,14 @@ from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from fractions import Fraction
 from functools import cache
-from itertools import accumulate
+from itertools import accumulate, pairwise
 from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor
 
 from dejavu_torch.maps.codec import Stream, decode
+from dejavu_torch.maps.digest import BYTES, PLACES, Digest, digests_of
 from dejavu_torch.maps.place_map import PlaceMap, ScoreBlocks, one_of, require
 from dejavu_torch.maps.spectrum import Transform, by_frequency, frequencies, from_lines, from_slots, slots
 from dejavu_torch.maps.summary import ChunkSummary, MapSummary
@@ -47,22 +48,26 @@ FILE = {  # dtype and dimensions of the tensors of a file
     "links": (torch.int32, 2),
     "columns": (torch.int32, 1),
     "turned": (torch.int8, 2),
+    "digest": (torch.uint8, 2),
 }
 LINK_SHARES = 1000  # the probability of a link is stored in thousandths
 STAGE = ("stage", "stage_scale", "drives")
-RARE = (*STAGE, "links", "columns", "turned")  # files of maps without them lack these
+RARE = (*STAGE, "links", "columns", "turned", "digest")  # files of maps without them lack these
 CHUNK_BYTES = 8 + 4 + 8 + 8  # a chunk's length, step, stream length and checksum in a file
+
+NO_DIGEST = Digest(torch.zeros(0, dtype=torch.int64), torch.zeros(0, BYTES, dtype=torch.uint8))
 
 
 class Chunk(NamedTuple):
     """Consecutive places as a file stores them; `unseen` are those whose descriptors are 0, from 0; `columns`
-    of a tile of an area, row by row."""
+    of a tile of an area, row by row; `digest` of those of its places that have one."""
 
     places: int
     step: float
     stream: Stream
     unseen: tuple[int, ...] = ()
     columns: int = 1
+    digest: Digest = NO_DIGEST
 
 
 class Lines(NamedTuple):
@@ -91,6 +96,8 @@ class SpectralMap(PlaceMap):
         turned: (K,K) int8, of turned images of an area, see `learn_turned`; empty if unknown.
         links: (L,3) int32, steps from a place of a route to one of another, and their probability in
             thousandths; see `connections`.
+        digest: (n,9) uint8, of the descriptors as they were learned, before the stage, of the places
+            that `layout.thinned` leaves; see `digests_of`. Empty in older files.
     Buffers derived from these:
         counts, feature, level: number of coefficients of each of N lines; for each of L coefficients its
             feature, ascending within a line, and its value in steps; in the smallest dtypes possible.
@@ -124,6 +131,7 @@ class SpectralMap(PlaceMap):
         "links": (0, 3),
         "columns": (0,),
         "turned": (0, 0),
+        "digest": (0, BYTES),
     }
 
     lengths: Tensor
@@ -169,8 +177,9 @@ class SpectralMap(PlaceMap):
 
     def _clear(self) -> None:
         """Remove all chunks and their decoded lines."""
-        for name in ("lengths", "steps", "stream_table", "streams", "visits", "columns"):
+        for name in ("lengths", "steps", "stream_table", "streams", "visits", "columns", "digest"):
             setattr(self, name, getattr(self, name)[:0])
+        self.digested = NO_DIGEST.places
         self.counts = self.lengths.to(_dtype_for(self.dimension))
         self.feature = self.lengths.to(_dtype_for(self.dimension - 1))
         self.level, self.norms = self.lengths.to(torch.int8), self.lengths.float()
@@ -219,6 +228,11 @@ class SpectralMap(PlaceMap):
             for start, chunk in zip(accumulate(places, initial=0), chunks, strict=False):
                 counts[[start + i for i in chunk.unseen if hides]] = 0
             self.count_visits(torch.cat([self.visit_counts, counts]))
+        starts, own = accumulate(places, initial=self.places), Digest(self.digested, self.digest.cpu())
+        more = [
+            Digest(chunk.digest.places + start, chunk.digest.rows)
+            for start, chunk in zip(starts, chunks, strict=False)
+        ]
         for chunk, (*_, level) in zip(chunks, parts, strict=True):
             self.chunks.append((self.places, self.places + chunk.places))
             self._bounds.append(self._bounds[-1] + len(level))
@@ -227,7 +241,18 @@ class SpectralMap(PlaceMap):
         append("norms", *norms)
         if not all(bool(part.isfinite().all()) for part in norms):
             raise InputError("the map does not fit together: its descriptors are not finite")
+        self._digest(Digest(*map(torch.cat, zip(own, *more, strict=True))))
         self._hide()
+
+    def know(self, descriptors: Tensor) -> None:
+        parts = [digests_of(descriptors[start:stop]) for start, stop in self.chunks]
+        self._digest(Digest(torch.arange(self.places), torch.cat(parts)))
+
+    def _digest(self, known: Digest) -> None:
+        """Keep what is known of the places that have a digest."""
+        places = self.layout.thinned(PLACES, self.places)
+        self.digest = known.of(places).to(self.device)
+        self.digested = places[: len(self.digest)]
 
     def count_visits(self, counts: Tensor) -> None:
         super().count_visits(counts)
@@ -262,7 +287,9 @@ class SpectralMap(PlaceMap):
         unseen = [
             tuple((counts == 0).nonzero()[:, 0].tolist()) for counts in self.visit_counts.split(lengths)
         ]
-        return [*map(Chunk, lengths, self.steps.tolist(), streams, unseen, self._columns())]
+        known, ends = Digest(self.digested, self.digest.cpu()), [*accumulate(lengths, initial=0)]
+        digest = [known.within(*each) for each in pairwise(ends)]
+        return [*map(Chunk, lengths, self.steps.tolist(), streams, unseen, self._columns(), digest)]
 
     def _columns(self) -> list[int]:
         """The columns of each chunk, from the tensors of a file."""
@@ -611,6 +638,8 @@ class SpectralMap(PlaceMap):
         require(bool(self.stage_scale.isfinite().all()), "a stage that is not finite")
         turned, square = tuple(self.turned.shape), 2 * (self.dimension,)
         require(turned in ((0, 0), square), f"turned images {turned}; expected {square}")
+        digest, whole = tuple(self.digest.shape), (len(layout.thinned(PLACES, self.places)), BYTES)
+        require(digest in ((0, BYTES), whole), f"a digest {digest}; expected {whole}")
         links, most = self.links, self.links.new_tensor([self.places - 1, self.places - 1, LINK_SHARES])
         row = f"rows of two places, and a number up to {LINK_SHARES}"
         fits = bool(((links >= 0) & (links <= most)).all())
@@ -619,6 +648,7 @@ class SpectralMap(PlaceMap):
 
     def loaded(self) -> None:
         """Decode the chunks of a file, and restore omitted means of 0."""
+        self.digested = self.layout.thinned(PLACES, self.places)[: len(self.digest)]
         chunks, visits = self.coded(), self.visits
         if self.dimension and not len(self.means):
             self.means = self.means.new_zeros(self.layout.count, self.dimension)
@@ -638,12 +668,13 @@ class SpectralMap(PlaceMap):
         packed = self.packed() if self.places else {}
         names = {"streams": "lines", "means": "mean", "positions": "positions", "visits": "visits"}
         stage = sum(packed.pop(name).nbytes for name in STAGE if name in packed)  # with the count of drives
-        turned = packed.pop("turned", self.turned).nbytes
+        turned, digest = (packed.pop(name, self.turned[:0]).nbytes for name in ("turned", "digest"))
         route = {part: packed[name].nbytes for name, part in names.items() if name in packed}
         route = {name: size for name, size in route.items() if size}
         route["chunks"] = sum(tensor.nbytes for name, tensor in packed.items() if name not in names)
         covered = int(((self.norms > 0) & self.norms.isfinite()).sum())
-        fixed = {part: size for part, size in (("stage", stage), ("turned", turned)) if size}
+        fixed = {"stage": stage, "turned": turned, "digest": digest}
+        fixed = {part: size for part, size in fixed.items() if size}
         sizes = len(self.level), self.layout.extents
         return MapSummary(self.kind, self.places, covered, 0, 0, tuple(chunks), route, fixed, *sizes)
 

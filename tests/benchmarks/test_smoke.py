@@ -17,6 +17,7 @@ from benchmarks import (
     front,
     live,
     order,
+    provenance,
     spread,
     tables,
     teaching,
@@ -122,6 +123,23 @@ def test_alike(films, monkeypatch):
     assert found["loops: road, once", CHECKED, 0.5]["right"] == 0
     monkeypatch.setattr(tables, "read", lambda name: {"rows": rows})
     assert [len(part.splitlines()) for part in tables.TABLES["alike"]().split("\n\n")] == [3, 4]
+
+
+def test_provenance(films, monkeypatch):
+    road = Route("{data}/road.npy", "{data}/drive.npy", 5, "{data}/truth.csv")
+    ready = Route("{data}/rows.npy", "{data}/again.npy")
+    rows = normalize(torch.nn.functional.avg_pool1d(torch.randn(1, 32, 190), 11, 1)[0].T, dim=1)
+    np.save(films / "rows.npy", rows.numpy())
+    np.save(films / "again.npy", (rows + 0.3 * normalize(torch.randn(1, 32))).numpy())
+    monkeypatch.setattr(provenance, "PAIRS", {"road": road, "rows": ready})
+    benchmark("provenance", films, "--out", films / "out")
+    rows = rows_of(films / "out")
+    found = {(row["case"], row["contender"]): row for row in rows if row["places"] is not None}
+    assert [found[case, provenance.VISIT]["told"] for case in ("road", "rows")] == ["", ""]
+    assert found["rows", provenance.OWN]["told"] == "frames"
+    assert found["rows", provenance.BETWEEN]["told"] == "between"
+    monkeypatch.setattr(tables, "read", lambda name: {"rows": rows})
+    assert [len(part.splitlines()) for part in tables.TABLES["provenance"]().split("\n\n")] == [4, 1]
 
 
 def test_chunks(tmp_path, monkeypatch):

@@ -134,6 +134,9 @@ def lines(form, count=12):
         "field.header.stamp,field.pose.position.x,field.pose.position.y\n"
         + lines(lambda i: f"{FIRST * 10**9 + i * 250_000_000},{i},0"),
         "time,x,y\n" + lines(lambda i: f"{FIRST + i / 4},{i},0\n{FIRST + i / 4},{i},0"),  # written twice
+        "Time,header.stamp.secs,header.stamp.nsecs,x,y\n"
+        + lines(lambda i: f"{FIRST + i / 4},{FIRST + i // 4},{i % 4 * 250_000_000},{i},0"),
+        "name,x,y\n" + lines(lambda i: f"{FIRST + i / 4:.2f},{i},0"),  # no suffix
     ],
 )
 def test_times_by_any_name_and_unit(text, stamped, tmp_path):
@@ -149,10 +152,26 @@ def test_times_by_any_name_and_unit(text, stamped, tmp_path):
         "frame,x,y\n" + "\n".join(f"{i},{i},0" for i in reversed(range(12))),
         "t,x,y\n" + lines(lambda i: f"{i / 10},{i},0"),  # times of frames that have none: a row a frame
         "x [cm],y [cm]\n" + lines(lambda i: f"{100 * i},0"),
+        "stamp,x,y\n" + lines(lambda i: f"2011-05-10T12:38:{i:02},{i},0"),
+        "frame_id,x,y\n" + lines(lambda i: f"map,{i},0"),
+        "easting,northing,altitude\n" + lines(lambda i: f"{i},0,{500 + i % 3}"),
     ],
 )
 def test_frames_by_name_or_number(text, counted, tmp_path):
     np.testing.assert_allclose(values(text, open_source(counted), tmp_path), [[i, 0] for i in range(12)])
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "image,x,y\n" + lines(lambda i: f"{i}.jpg,{i // 4},0"),
+        "file,x,y\n" + lines(lambda i: f"drive.bag,{i // 4},0"),
+        "t,x,y\n" + lines(lambda i: f"{i // 4},{i // 4},0"),  # a camera that stands, by a clock of seconds
+    ],
+)
+def test_a_row_for_each_frame_that_has_no_name(text, tmp_path):
+    found = values(text, ArrayTraverse(torch.rand(12, 4), "ready"), tmp_path)
+    assert found == [[i // 4, 0] for i in range(12)]
 
 
 @pytest.mark.parametrize(
@@ -184,11 +203,11 @@ def test_times_of_another_clock_or_of_few_digits_are_refused(stamped, tmp_path):
 
 
 def test_what_is_not_used_and_what_is_no_fix_are_told(counted, tmp_path, caplog):
-    text = "lat,lon,sats\n" + lines(lambda i: f"{48 + 1e-5 * i},11,7" if i > 3 else "0,0,0")
+    text = "lat,lon,alt,sats\n" + lines(lambda i: f"{48 + 1e-5 * i},11,500,7" if i > 3 else "0,0,0,0")
     found = values(text, open_source(counted), tmp_path)
     assert [row[0] for row in found][4:] == [48 + 1e-5 * i for i in range(4, 12)]
     assert np.isnan(found[:4]).all()
-    assert "the column sats is not used" in caplog.text
+    assert "the columns alt, sats are not used" in caplog.text
     assert "4 fixes at 0, 0" in caplog.text
     assert "4 of 12 frames have no coordinates" in caplog.text
 
@@ -205,7 +224,7 @@ def test_heights_are_compared_only_if_both_visits_have_them(tmp_path, caplog):
     """Poses of KITTI have the height in the second of three numbers, and down."""
     three = ArrayTraverse(torch.rand(3, 4), "poses")
     two = ArrayTraverse(torch.rand(3, 4), "gps")
-    (tmp_path / "p.txt").write_text("\n".join(f"1 0 0 {i} 0 1 0 -7 0 0 1 {10 * i}" for i in range(3)))
+    (tmp_path / "p.txt").write_text("\n".join(f"1 0 0 {i} 0 1 0 -7 0 0 1 {10 * i} " for i in range(3)))
     (tmp_path / "g.csv").write_text("x,y\n" + "\n".join(f"{i},{10 * i}" for i in range(3)))
     three.coordinates, *_ = read_coordinates(tmp_path / "p.txt", three)
     two.coordinates, *_ = read_coordinates(tmp_path / "g.csv", two)
@@ -213,7 +232,12 @@ def test_heights_are_compared_only_if_both_visits_have_them(tmp_path, caplog):
     assert one.tolist() == other.tolist() == [[0, 0], [1, 10], [2, 20]]
     assert "gps has coordinates of two numbers" in caplog.text
     one, other = coordinates_of([three, three], "metres")
-    assert one[1].tolist() == [1, -7, 10]
+    assert one[1].tolist() == [1, 10, -7]  # the height last
+    (tmp_path / "g.csv").write_text("x,y,z\n" + "\n".join(f"{i},{10 * i},7" for i in range(3)))
+    two.coordinates, _ = read_coordinates(tmp_path / "g.csv", two)
+    one, other = coordinates_of([three, two], "metres")
+    assert one.tolist() == other.tolist() == [[0, 0], [1, 10], [2, 20]]
+    assert "poses has coordinates of another axis for heights" in caplog.text
 
 
 def test_parts_and_chains_keep_coordinates(tmp_path):
@@ -295,6 +319,10 @@ def test_a_column_of_coordinates_is_cut_with_the_frames(tmp_path, caplog):
     np.testing.assert_allclose(some.moves, [[0, 0], [5, 13**0.5], [9, 41**0.5]])
     assert some.metres
     assert "not used" not in caplog.text
+    (tmp_path / "where.csv").write_text("x,y,moved\n" + "0,0,1\n" * 5 + "0,0,yes\n")
+    assert open_source(source).odometer is None
+    assert "the column moved is not used" in caplog.text
+    assert "line 7: moved is 'yes'" in caplog.text
 
 
 def test_coordinates_tell_what_an_odometer_would_read():

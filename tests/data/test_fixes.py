@@ -38,6 +38,13 @@ def changed(rows, values, path=ROAD):
             "3 fixes from line 297 on lie",
         ),
         (changed(slice(200, 202), 2 * ROAD[200:202] - AWAY[200:202]), [200, 201], "m off the path"),
+        (
+            changed(slice(50, 53), ROAD[50:53] + 750 * np.array([[1, 0], [0, 1], [-1, 0]])),
+            [50, 51, 52],
+            "3 fixes",
+        ),
+        (changed(range(20, 220, 20), AWAY[20:220:20]), range(20, 220, 20), "10 fixes from line 20 on lie"),
+        (changed([0, 1, 90, 91], AWAY[[0, 1, 90, 91]]), [0, 1, 90, 91], "4 fixes from line 0 on lie"),
     ],
 )
 def test_no_fix_is_no_place(path, unknown, words):
@@ -57,6 +64,7 @@ def test_no_fix_is_no_place(path, unknown, words):
         np.random.default_rng(0).uniform(0, 1000, (200, 2)),  # frames in no order
         np.stack(np.meshgrid(8.0 * np.arange(40), 8.0 * np.arange(30)), -1).reshape(-1, 2),  # an area
         np.concatenate([ROAD, ROAD[::-1]]),  # there and back
+        np.repeat(np.random.default_rng(0).uniform(0, 100, (30, 2)), 12, 0),  # views of places here and there
         ROAD[:3],
         ROAD[:1],
         ROAD[:0],
@@ -77,6 +85,18 @@ def test_between_fixes_that_change_every_so_often_is_interpolated(each):
     np.testing.assert_allclose(found[:stop], ROAD[:stop], atol=1.0)
 
 
+def test_between_fixes_a_stop_and_a_gap_stay():
+    """A fix that stays longer was at a stop; where fixes are missing, no frame hurries to the next one."""
+    rows = [*range(150), *[149] * 60, *range(150, 300)]
+    found, _ = checked_fixes(ROAD[[row // 10 * 10 for row in rows]])
+    np.testing.assert_allclose(found[160:200], ROAD[[140] * 40])
+    path = np.repeat(ROAD[::10], 10, 0)
+    path[100:150] = np.nan
+    found, _ = checked_fixes(path)
+    known = [*range(100), *range(150, 290)]
+    np.testing.assert_allclose(found[known], ROAD[known], atol=6)
+
+
 def test_longitudes_go_on_across_180_degrees():
     found, seen = checked_fixes(DEGREES, degrees=True)
     assert not seen
@@ -92,3 +112,5 @@ def test_a_jump_that_stays_is_told():
     np.testing.assert_array_equal(found, path)
     assert "the path jumps 7" in seen[0]
     assert "after line 151" in seen[0]
+    path = changed(slice(100, 130), AWAY[100:130])
+    assert "after line 99, and again after line 129" in checked_fixes(path)[1][0]

@@ -699,6 +699,8 @@ def test_rows_beyond_the_last_frame_are_refused_but_for_a_stop(tmp_path, caplog)
     truth = ask(long, frame_range(frames_of(10), stop=8))
     assert truth.positives.tolist() == [[i] for i in range(8)]
     assert "2 of its right places lie beyond a stop" in caplog.text
+    ask("\n".join(f"{i},{i}" for i in range(4)), frame_range(frames_of(10), stop=9, step=3))
+    assert "1 of its right places lie beyond a stop" in caplog.text
     truth = ask("0,3\n1,9\n2,5\n", frames_of(3), frame_range(frames_of(10), stop=8))
     assert truth.positives.tolist() == [[3], [-1], [5]]
 

@@ -34,7 +34,7 @@ def judged(places, truth, queries=Q, tolerance=5, sure=0.95, **more):
     probability = torch.full((len(places),), sure)
     match = Match(places, torch.zeros(len(places)), torch.ones(len(places), dtype=torch.bool), probability)
     right = (places - truth).abs() <= tolerance
-    return Judged(match, queries, right, torch.ones_like(right), max(tolerance, 5), "truth.csv", 300, **more)
+    return Judged(match, queries, right, torch.ones_like(right), tolerance, "truth.csv", 3000, **more)
 
 
 def told(*args, **more):
@@ -90,15 +90,38 @@ def test_a_line_is_found_within_its_width(slope, offset, seed):
         (torch.randperm(300, generator=torch.Generator().manual_seed(0)), Q, {}),  # an honest failure
         (torch.where(Q % 10 < 1, (7 * Q) % 300, Q), Q, {}),  # a tenth is wrong
         (torch.where(Q < 150, Q, (7 * Q) % 300), Q, {}),  # half of it anywhere
-        (Q + 50 * ((Q >= 100) & (Q < 200)), Q, {}),  # a third at a place that looks alike
+        (Q + 50 * ((Q >= 100) & (Q < 200)) + 20 * (Q >= 200), Q, {}),  # a third at a place that looks alike
         (torch.full_like(Q, 70), Q, {}),
+        (torch.where(Q < 180, Q + 120, Q), Q, {}),  # most at a place that looks alike
+        (Q + torch.randint(-2, 3, (300,), generator=torch.Generator().manual_seed(0)), Q, {"tolerance": 0}),
         (Q + 40, Q, {"sure": 0.8}),
         (Q + 40, Q, {"alone": torch.randperm(300, generator=torch.Generator().manual_seed(0))}),  # elsewhere
     ],
-    ids=["right", "near", "anywhere", "tenth", "half", "alike", "one place", "unsure", "single images deny"],
+    ids=[
+        "right",
+        "near",
+        "anywhere",
+        "tenth",
+        "half",
+        "alike",
+        "one place",
+        "most alike",
+        "strict",
+        "unsure",
+        "single images deny",
+    ],
 )
 def test_where_nothing_explains_nothing_is_told(places, truth, more):
     assert not told(places, truth, **more)
+
+
+def test_the_lines_to_give_name_frames_that_are_there():
+    """Answers of the part of a drive that the reference shows."""
+    queries = Q + 50
+    ((_, text),) = told(2 * queries - 100, queries, queries)
+    assert "lines 50,0 and 349,598" in text
+    one = judged(6 * Q, Q)._replace(places=1000)
+    assert "lines 0,0 and 166,996" in str(contradictions(one)[0])
 
 
 def test_few_answers_tell_nothing():
@@ -156,6 +179,37 @@ def test_coordinates_that_agree_another_way(stored, own, more, kind, words):
     assert [doubt.kind for doubt in doubts] == ([] if kind is None else [kind])
     for word in words:
         assert word in str(doubts[0])
+
+
+@pytest.mark.parametrize(
+    "way",
+    [
+        road,
+        lambda s: 100 * torch.stack([torch.cos(s / 30), torch.sin(s / 30)], 1),  # laps
+        lambda s: road(torch.where(s < 150, s, 300 - s)),  # there and back
+    ],
+)
+def test_a_clock_that_leaves_many_frames_without_coordinates(way):
+    """90 of 300 frames have none, and the places of 90 others are not in the file."""
+    q = Q.double()
+    own = way(q - 90).masked_fill((Q < 90)[:, None], math.nan)
+    one, ground = grounds(way(q), own, second=0.2)
+    one = one._replace(judged=Q >= 90)
+    (doubt,) = contradictions(one, ground)
+    assert doubt.kind == "clock"
+    assert "120 of 210" in doubt.text
+    assert "if its times are 18.0 s earlier" in doubt.text
+    stays = torch.where(Q < 120, Q + 180, Q)  # most look like a later place, and the others are right
+    assert not contradictions(*grounds(way(q), way(q), stays))
+
+
+def test_between_places_and_within_one_no_move_is_told():
+    """Queries half way between two places; and answers of another route, all within the radius."""
+    path = torch.stack([10.0 * Q, 0.0 * Q], 1).double()
+    assert not contradictions(*grounds(path, path + torch.tensor([4.9, 0.0]), radius=6.0))
+    draw = torch.Generator().manual_seed(0)
+    shuffled = torch.randperm(300, generator=draw)
+    assert not contradictions(*grounds(PATH / 9, PATH / 9 + 5000, shuffled, radius=100.0))
 
 
 def test_where_several_explain_they_are_named_together():
@@ -227,7 +281,8 @@ def test_a_report_tells_it_first(tmp_path, capsys):
     rows = torch.nn.functional.normalize(
         torch.randn(300, 16, generator=torch.Generator().manual_seed(0)), dim=1
     )
-    reference, query = ArrayTraverse(rows, "a"), ArrayTraverse(rows.clone(), "b")
+    other = 0.15 * torch.randn(300, 16, generator=torch.Generator().manual_seed(1))
+    reference, query = ArrayTraverse(rows, "a"), ArrayTraverse(rows + other, "b")
     reference.coordinates, query.coordinates = Coordinates(PATH), Coordinates((PATH - PATH[50]) @ TURN.T)
     found = compare(reference, query, "metres:25", tolerance=5)
     (doubt,) = found.report.facts["doubts"]

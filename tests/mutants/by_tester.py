@@ -6,6 +6,27 @@ from .mutant import Mutant
 
 MUTANTS = [
     Mutant(
+        "A frame is between two queries if it differs from both in few signs, not from one of them.",
+        "dejavu_torch/recognition/provenance.py",
+        "beyond = torch.stack([(differs & one).sum(1) for one in beside]).amin(0)",
+        "beyond = differs.sum(1)",
+        ("tests/recognition/test_provenance.py::-k dense",),
+    ),
+    Mutant(
+        "Equal pictures of a camera that stands tell nothing of where queries come from.",
+        "dejavu_torch/recognition/provenance.py",
+        "(nearest == 0) & (changed >= CHANGED)",
+        "(nearest == 0)",
+        ("tests/recognition/test_provenance.py::-k too_few",),
+    ),
+    Mutant(
+        "The digest of places that are means of visits is that of the reference alone.",
+        "dejavu_torch/learning.py",
+        "return chunk._replace(digest=digest)",
+        "return chunk",
+        ("tests/recognition/test_provenance.py::-k average_leave",),
+    ),
+    Mutant(
         "The frame of a reference video that the page asks for is decoded before all others.",
         "dejavu_torch/live/page.py",
         "at = max(0, asked - BEFORE // step * step)",
@@ -673,6 +694,48 @@ MUTANTS = [
         "copies = copies if self.span == (0, 1) else low + (high - low) * copies",
         "copies = copies",
         ("tests/features/test_preprocess.py::-k few_values",),
+    ),
+    Mutant(
+        "Odometry begins at 0, 0: only fixes there that lie far from the next one are none.",
+        "dejavu_torch/data/fixes.py",
+        "and _far(values, at, degrees)",
+        "",
+        ("tests/data/test_fixes.py::-k camera_does",),
+    ),
+    Mutant(
+        "A camera that stops goes on from where it was: its fix is not held.",
+        "dejavu_torch/data/fixes.py",
+        "length >= HELD and step > max(MADE_UP, length / MADE_UP) * usual",
+        "length >= HELD",
+        ("tests/data/test_fixes.py::-k camera_does",),
+    ),
+    Mutant(
+        "An offset that grows goes one way: answers at a place that looks alike come back.",
+        "dejavu_torch/evaluation/agreement.py",
+        "float(steps) <= STRAY * way + within and ",
+        "",
+        ("tests/evaluation/test_agreement.py::-k nothing_explains",),
+    ),
+    Mutant(
+        "A drive elsewhere lies on a line, too; single images tell that it is none of this map.",
+        "dejavu_torch/evaluation/agreement.py",
+        "if distinct >= LEAST and self._shown(numbers)",
+        "if distinct >= LEAST",
+        ("tests/evaluation/test_agreement.py::-k nothing_explains",),
+    ),
+    Mutant(
+        "Heights that vary are no floors.",
+        "dejavu_torch/evaluation/agreement.py",
+        "return gap if float(alike) >= EXPLAINED else 0.0",
+        "return gap",
+        ("tests/evaluation/test_agreement.py::-k floors",),
+    ),
+    Mutant(
+        "A message that was written twice is one row.",
+        "dejavu_torch/data/coordinates.py",
+        "table.distinct() if",
+        "table if",
+        ("tests/data/test_coordinates.py::-k any_name_and_unit",),
     ),
     Mutant(
         "Positions are not interpolated across gaps of over a second.",

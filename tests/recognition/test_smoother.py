@@ -245,6 +245,8 @@ def test_a_stop_is_one_of_the_queries_that_another_speed_has_to_explain():
     assert stopped.is_drive
     assert stopped.tempering == pytest.approx(moving.tempering, rel=0.01)
     assert moving.tempering > 3
+    nats = [one.settled()["nats_per_query"] for one in (stopped, moving)]
+    assert nats[0] == pytest.approx(nats[1], rel=0.2)
     found = stopped(scores[at], seen).argmin(1)
     assert ((found - 4 * at).abs() <= 5).double().mean() > 0.99
 

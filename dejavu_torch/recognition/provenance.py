@@ -1,0 +1,195 @@
+"""Queries that are not independent of a map, or not made as it was: of whose answers little follows."""
+
+from __future__ import annotations
+
+import logging
+import math
+from base64 import b64decode, b64encode
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal, NamedTuple
+
+import torch
+from torch import Tensor
+
+from dejavu_torch.data.traverse import Part
+from dejavu_torch.maps.digest import BITS, BYTES, digests_of, signs_of
+from dejavu_torch.maps.place_map import PlaceMap
+from dejavu_torch.types import Doubt, Facts, InputError, Traverse
+
+log = logging.getLogger("dejavu_torch")
+
+ASKED = 2**17  # queries that are looked at, the first ones
+ROWS = 256  # of ready descriptors whose mean is taken, at most
+
+# Chosen on every other route of `benchmarks provenance`, which tells of the others.
+SAME, FEWEST_SAME = 0.15, 8  # share of the places, and places, at least, that a query equals
+CHANGED = 3  # signs that change to the next frame, at least, so that equal ones tell something
+BETWEEN, FEWEST_BETWEEN = 0.31, 32  # signs beyond both queries, as a share of those that change; places
+CORRELATED, STEADY = 0.25, 0.3  # means of other networks at most, and of parts of one drive at least
+LARGER = 4.0  # ratio of the sizes of one network's, at most
+WIDE, FEWEST_SPREAD = 16, 50  # dimensions, and descriptors, of fewer of which nothing is told
+
+Relation = Literal["", "frames", "between"]
+SEEN: dict[Relation, str] = {
+    "frames": "frames of the map itself",
+    "between": "frames between those of the map, as of the same drive",
+}
+SO = "another visit will be found less often"
+
+
+class Spread(NamedTuple):
+    """Ready descriptors: mean of each dimension about that of all, as int8 up to 127; root mean square of all
+    numbers; and the least correlation of the mean of a quarter of them with that of the others."""
+
+    mean: bytes
+    size: float
+    steady: float
+
+    @classmethod
+    def of(cls, traverse: Traverse) -> Spread | None:
+        """That of a traverse; None of frames, of few descriptors, and of few dimensions."""
+        if len(traverse.frame_shape) != 1 or traverse.frame_shape[0] < WIDE:
+            return None
+        rows = Part(traverse, range(0, len(traverse), -(-len(traverse) // ROWS)))[:].float()
+        rows = rows[rows.any(1)]
+        if len(rows) < FEWEST_SPREAD or not rows.square().mean().isfinite():
+            return None
+        total = rows.sum(0)
+        sums = [(part.sum(0), total - part.sum(0)) for part in rows.tensor_split(4)]
+        about = total - total.mean()
+        mean = (about * (127 / about.abs().max().clamp(min=1e-30))).round().to(torch.int8)
+        size = float(rows.square().mean().sqrt())
+        return cls(mean.numpy().tobytes(), size, min(correlation(*pair) for pair in sums))
+
+    def correlation(self, other: Spread) -> float:
+        """That of the means of two drives."""
+        means = (torch.tensor([*one.mean]).to(torch.uint8).view(torch.int8).float() for one in (self, other))
+        return correlation(*means)
+
+    def unlike(self, other: Spread) -> bool:
+        """Whether descriptors of the other seem to be made by something else."""
+        ratio = max(other.size, 1e-30) / max(self.size, 1e-30)
+        far = abs(math.log(ratio)) > math.log(LARGER)
+        alike = len(other.mean) != len(self.mean)  # which is refused elsewhere
+        return not alike and (far or (self.steady >= STEADY and self.correlation(other) < CORRELATED))
+
+
+def correlation(one: Tensor, other: Tensor) -> float:
+    """Of two vectors; 0 if one of them is constant."""
+    return float(torch.nn.functional.cosine_similarity(one - one.mean(), other - other.mean(), 0))
+
+
+@dataclass(frozen=True)
+class Provenance:
+    """Where a map comes from, beside what makes its descriptors.
+
+    Attributes:
+        maker: of ready descriptors, as their files tell; "" if they do not. spread: of these.
+        taught: names of the traverses that taught it beside its own (further visits, drives, those it was
+            calibrated by), and digests of some of their frames.
+    """
+
+    maker: str = ""
+    spread: Spread | None = None
+    taught: tuple[tuple[str, bytes], ...] = ()
+
+    @classmethod
+    def of(cls, traverse: Traverse) -> Provenance:
+        """Of a map that is learned from a traverse."""
+        return cls(traverse.maker, Spread.of(traverse))
+
+    @classmethod
+    def merged(cls, parts: Sequence[Provenance]) -> Provenance:
+        """That of a map of several."""
+        return replace(parts[0], taught=tuple(dict.fromkeys(one for part in parts for one in part.taught)))
+
+    def taught_by(self, name: str, digests: Tensor) -> Provenance:
+        """The same of a map that a traverse has taught, too."""
+        return self.merged([self, Provenance(taught=((name, digests.numpy().tobytes()),))])
+
+    def stored(self) -> Facts:
+        """As JSON values, without what is not known."""
+        spread = self.spread and [b64encode(self.spread.mean).decode(), *self.spread[1:]]
+        taught = [[name, b64encode(digests).decode()] for name, digests in self.taught]
+        facts = {"maker": self.maker, "spread": spread, "taught": taught}
+        return {name: value for name, value in facts.items() if value}
+
+    @classmethod
+    def restored(cls, facts: Facts) -> Provenance:
+        """From the result of `stored`."""
+        spread = (known := facts.get("spread")) and Spread(b64decode(known[0]), *map(float, known[1:]))
+        taught = tuple((name, b64decode(digests)) for name, digests in facts.get("taught", ()))
+        return cls(facts.get("maker", ""), spread, taught)
+
+    def unlike(self, queries: Traverse) -> str:
+        """What is said of ready descriptors that seem to be made by something else; "" of others."""
+        if self.spread is None or (self.maker and queries.maker) or (own := Spread.of(queries)) is None:
+            return ""
+        line = f"the descriptors of {queries.name} differ from the map's as those of another network do"
+        return line if self.spread.unlike(own) else ""
+
+    def doubts(self, place_map: PlaceMap, digests: Tensor, queries: Traverse) -> list[Doubt]:
+        """Why answers to queries may mislead, of which there are digests (Q,9)."""
+        lines, found = [self.unlike(queries)], alike(place_map.digest, digests).relation
+        known = [(name, torch.tensor([*own], dtype=torch.uint8).view(-1, BYTES)) for name, own in self.taught]
+        names = [name for name, own in known if not found and alike(own, digests).relation]
+        lines += [f"the queries are {SEEN[found]}: {SO}"] if found else []
+        lines += [f"the queries taught this map ({', '.join(names)}): {SO}"] if names else []
+        return [Doubt("provenance", line) for line in lines if line]
+
+
+class Alike(NamedTuple):
+    """How queries and the places of a map, or of a drive, are alike.
+
+    places: that are compared. same: of them that equal a query. beyond: signs in which places differ from
+    both of two queries that follow each other, in proportion to those that change from a query, or a place,
+    to the next.
+    """
+
+    places: int = 0
+    same: int = 0
+    beyond: float = math.inf
+
+    @property
+    def relation(self) -> Relation:
+        """Whether the queries are frames of the map, or lie between them."""
+        if self.same >= max(FEWEST_SAME, SAME * self.places):
+            return "frames"
+        return "between" if self.places >= FEWEST_BETWEEN and self.beyond <= BETWEEN else ""
+
+
+def alike(known: Tensor, asked: Tensor) -> Alike:
+    """Compare places with the nearest queries, where both are nearest to each other. A frame that was taken
+    between two queries differs from both in few signs. Where signs change nearly at random from frame to
+    frame, as in sparse footage, nothing can be told.
+
+    Args:
+        known: (n,9) digests of the places. asked: (Q,9) of the queries, in order if they are.
+    """
+    known, asked = (one[(one[:, :-1] > 0).any(1)] for one in (known.cpu(), asked[:ASKED].cpu()))
+    if min(len(known), len(asked)) < FEWEST_SAME:
+        return Alike()
+    places, queries = signs_of(known), signs_of(asked)
+    apart = (BITS - places @ queries.T) / 2
+    nearest, at = apart.min(1)
+    pairs = nearest == apart.amin(0)[at]
+    places, nearest, at = places[pairs], nearest[pairs], at[pairs]
+    others = ((BITS - queries[at] @ queries.T) / 2).scatter_(1, at[:, None], BITS).amin(1)
+    changed = torch.minimum(others, known[pairs, -1].float())
+    differs = queries[at] != places
+    beside = [queries[(at + step).clamp(0, len(queries) - 1)] != places for step in (-1, 1)]
+    beyond = torch.stack([(differs & one).sum(1) for one in beside]).amin(0)
+    same = int(((nearest == 0) & (changed >= CHANGED)).sum())
+    return Alike(len(places), same, float(beyond.sum()) / max(float(changed.sum()), 1e-9))
+
+
+def check_independent(place_map: PlaceMap, visit: Traverse, descriptors: Tensor) -> None:
+    """Refuse to calibrate a map by its own drive; of ready descriptors between its frames only warn, since
+    those of another visit with little noise look alike."""
+    found = alike(place_map.digest, digests_of(descriptors, follow=False)).relation
+    line = f"calibrating by {visit.name}: it has {SEEN[found]}" if found else ""
+    if found == "frames" or (found and len(visit.frame_shape) == 3):
+        raise InputError(f"{line}; expected another visit")
+    if found:
+        log.warning("%s; probabilities may be too high", line)
