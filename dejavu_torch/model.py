@@ -43,16 +43,16 @@ from dejavu_torch.recognition.coarse import searcher
 from dejavu_torch.recognition.drive import FEWER
 from dejavu_torch.recognition.large import is_large
 from dejavu_torch.recognition.localizer import SINGLE, Localizer, Matching, answer
-from dejavu_torch.recognition.odometry import checked_moved, read_moved
+from dejavu_torch.recognition.odometry import Moved, moves_of
 from dejavu_torch.recognition.provenance import Provenance
-from dejavu_torch.recognition.querying import QUERYING, Querying, Sequences
+from dejavu_torch.recognition.querying import QUERYING, Drives, Querying, Sequences
 from dejavu_torch.recognition.scorer import Earlier, OfMap, Scorer
 from dejavu_torch.recognition.search import Scan, Search, Searcher, check_search
 from dejavu_torch.recognition.select import HIGHEST, PROBABLE, Acceptance, check_candidates
 from dejavu_torch.recognition.smoother import PlaceSmoother
 from dejavu_torch.recognition.views import ALONE, FIRST, LEAST, Views, best_pairs
 from dejavu_torch.resize import reduced_size, turned_hint
-from dejavu_torch.types import Facts, InputError, Match, SequenceModel, Traverse, expect
+from dejavu_torch.types import Facts, InputError, Match, Odometer, SequenceModel, Traverse, expect
 
 if TYPE_CHECKING:
     from dejavu_torch.recognition.calibration import Calibration
@@ -407,7 +407,7 @@ class DejaVu(nn.Module):
         centre: bool | None = None,
         headings: int = 1,
         shifts: Literal["auto", "none"] | Sequence[float] = "auto",
-        moved: Tensor | None = None,
+        moved: str | Path | Moved | None = None,
     ) -> Match:
         """Section III-C: the best place of each query and whether it is accepted (eq. 5, eq. 6).
 
@@ -429,7 +429,8 @@ class DejaVu(nn.Module):
             shifts: views of each image, moved sideways, of which the best answers, for a camera that points
                 a little further right or left than at learning; see `Querying`. `Match.shift` says how far.
             moved: (Q,), by how many places the camera moved to each query from the one before it, as odometry
-                tells, at least 0; the first does not count. For a smoother or a filter along a route.
+                tells, at least 0, the first does not count; or these and their standard deviation, or an
+                `Odometer`, or what `--moved` takes. For a smoother or a filter along a route.
 
         Shape: -> Match of (Q,) on the CPU.
 
@@ -549,7 +550,7 @@ class DejaVu(nn.Module):
             expect(len(queries) == self.map.places, "the traverse that the map was learned from", seen)
             check_apart(loops, len(queries))
         ordered = queries.ordered or sequence is not None if ordered is None else ordered
-        moved = self._moved(querying.moved, sequence, queries)
+        moved = None if loops is not None else self.moved(queries, querying, sequence)
         matching = matching._replace(moved=moved, ordered=bool(ordered))
         whole = sequence is not None and sequence.whole
         centres = loops is None and querying.centres(whole and self.centres(len(queries)))
@@ -577,22 +578,28 @@ class DejaVu(nn.Module):
         descriptors = self.described(queries, querying, centres, progress, on_first, heard)
         yield answer(self.scorer(descriptors, matching), matching, progress)
 
-    def _moved(
-        self, told: Path | Tensor | None, sequence: SequenceModel | None, queries: Traverse
-    ) -> Tensor | None:
-        """What odometry tells of queries, from a file or as given."""
-        if told is None:
+    def moved(self, queries: Traverse, asked: Drives, sequence: SequenceModel | None) -> Odometer | None:
+        """What an odometer reads at queries that are matched so, see `moves_of`; one that nobody asked for is
+        left out with a warning where it is of no use."""
+        try:
+            moved = moves_of(queries, asked.moved, asked.metres_per_place)
+            if moved is None:
+                return None
+            seen = "places moved, and single images or a sequence of constant speed"
+            if sequence is None or sequence.answers not in ("drive", "filter"):
+                raise InputError(f"{seen}; expected a drive or a filter")
+            expect(self.step is None, "a map of frames as they are", "places moved, and a map of even steps")
+            self.map.layout.expect_route("a route", "places moved, and the map of an area")
+            seen = f"places moved, and {len(queries)} queries on {self.map.places} places"
+            expect(not sequence.whole or not is_large(len(queries), self.map.places), FEWER, seen)
+            seen = "metres moved, and a filter"
+            expect(sequence.whole or not moved.metres, "--metres_per_place, or a drive", seen)
+            return moved
+        except InputError as error:
+            if asked.moved is not None or asked.metres_per_place is not None:
+                raise
+            log.warning("%s: its column moved is not used: %s", queries.name, error)
             return None
-        moved = read_moved(told) if isinstance(told, Path) else told
-        expect(self.step is None, "a map of frames as they are", "places moved, and a map of even steps")
-        seen = "places moved, and single images or a sequence of constant speed"
-        if sequence is None or sequence.answers not in ("drive", "filter"):
-            raise InputError(f"{seen}; expected a drive or a filter")
-        self.map.layout.expect_route("a route", "places moved, and the map of an area")
-        moved = checked_moved(moved, len(queries))
-        seen = f"places moved, and {len(queries)} queries on {self.map.places} places"
-        expect(not sequence.whole or not is_large(len(queries), self.map.places), FEWER, seen)
-        return moved
 
     def described(
         self,

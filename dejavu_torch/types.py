@@ -64,6 +64,7 @@ class Traverse(Dataset[Tensor], ABC):
         times: (N,) float64, when each was taken, in seconds; None if unknown.
         places: (N,) float64, the true position of each in reference frames; None if unknown.
         coordinates: where each was taken, see `Coordinates`; None if unknown.
+        odometer: what it reads at each, see `Odometer`; None if unknown.
         headings: (N,) float64, degrees clockwise from north to where the upper side of a camera that looks
             down points, NaN where that is unknown; None if all are.
         ordered: whether they are known to be consecutive, as in a video; see the filter and sequences.
@@ -89,6 +90,7 @@ class Traverse(Dataset[Tensor], ABC):
     times: Tensor | None = None
     places: Tensor | None = None
     coordinates: Coordinates | None = None
+    odometer: Odometer | None = None
     headings: Tensor | None = None
     ordered: bool = False
     sized: bool = False
@@ -212,6 +214,29 @@ class Coordinates(NamedTuple):
         return self.values if self.values.shape[1] < 3 else self.values[:, [*ground, self.height]]
 
 
+class Odometer(NamedTuple):
+    """What an odometer reads at frames: (N,2) float64, the way so far, in places or metres, and its variance,
+    NaN if that is unknown."""
+
+    values: Tensor
+    metres: bool = False
+
+    def between(self, before: int | Tensor, after: int | Tensor) -> Tensor:
+        """The way from frames to others, and its standard deviation: (n,2)."""
+        way, variance = (self.values[after] - self.values[before]).round(decimals=9).unbind(-1)
+        return torch.stack([way, variance.sqrt()], -1)
+
+    @property
+    def moves(self) -> Tensor:
+        """As `between`, from each frame to the next; none to the first: (N,2)."""
+        frames = torch.arange(len(self.values))
+        return self.between((frames - 1).clamp(min=0), frames)
+
+    def times(self, scale: float) -> Odometer:
+        """In places, by those in one of the unit."""
+        return Odometer(self.values * torch.tensor([scale, scale**2], dtype=torch.float64))
+
+
 @dataclass(frozen=True)
 class FrequencyLayer:
     """Features that repeat with one period inside one chunk of the route (section III-A).
@@ -281,6 +306,8 @@ class Match:
         stale: int64, how many queries in a row, up to this one, repeat the picture of the one before them,
             bit by bit, as of a stream that has stalled: the camera may have moved on. None if the
             queries are in no order.
+        speed: float, places a query at which a whole drive along a route goes at an answer, below 0 against
+            their order; NaN where answers around it are no surer than .5.
         sequences: by T, matches (Q,) of the same queries in sequences, a filter or a smoother, for reports;
             mostly empty.
         smoother: of a whole drive, the `PlaceSmoother` as it was fitted to the queries, which tells whether
@@ -297,12 +324,13 @@ class Match:
     shift: Tensor | None = None
     shift_degrees: Tensor | None = None
     stale: Tensor | None = None
+    speed: Tensor | None = None
     sequences: Mapping[Together, Match] = field(default_factory=dict)
     smoother: SequenceModel | None = None
 
     @property
     def columns(self) -> dict[str, Tensor]:
-        """Those of the ten columns that are known, by name."""
+        """Those of the eleven columns that are known, by name."""
         return {name: column for name, column in vars(self).items() if isinstance(column, Tensor)}
 
     @property

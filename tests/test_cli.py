@@ -42,7 +42,7 @@ def test_localize_writes_one_row_a_query_as_python_finds_them(small_map, tmp_pat
     rows = list(csv.DictReader((tmp_path / "m.csv").open()))
     model = DejaVu.load(small_map)
     match = model.localize(open_source(QUERY))
-    columns = ["query", "place", "score", "accepted", "probability", "confidence", "stale"]
+    columns = ["query", "place", "score", "accepted", "probability", "confidence", "stale", "speed"]
     assert list(rows[0]) == [*columns, "query_name", "place_name"]
     assert [int(row["query"]) for row in rows] == list(range(96))
     assert match.probability is not None

@@ -23,6 +23,7 @@ from videos import H264, clip, piped
 from dejavu_torch import DejaVu, LiveLocalizer, PlaceFilter, SpectralMapper, Whitening, open_source
 from dejavu_torch.data.traverse import at_size
 from dejavu_torch.live.page import Page
+from dejavu_torch.recognition.querying import DRIVES
 
 KEYS = ["frame", "time", "place", "reference_frame", "name", "score", "posterior", "probability", "accepted"]
 KEYS += ["milliseconds"]
@@ -122,10 +123,10 @@ def test_frames_are_dropped_in_real_time_only(folder, capsys, monkeypatch):
     due = LiveLocalizer.due
     left_out = []
 
-    def slow(self, frame, dropped=0):
+    def slow(self, frame, dropped=0, moved=None):
         left_out.append(dropped)
         time.sleep(0.1)
-        return due(self, frame, dropped)
+        return due(self, frame, dropped, moved)
 
     monkeypatch.setattr(LiveLocalizer, "due", slow)
     run("live", folder / "map.safetensors", folder / "second.mkv", "--realtime")
@@ -220,6 +221,9 @@ def test_a_process_that_nobody_needs_any_more_ends(how, folder, tmp_path):
         ("sim:aerial?frames=20 --reference sim:aerial", "--page"),
         ("sim:aerial?frames=20 --page 0 --reference sim:aerial?frames=20", "20 frames"),
         ("/dev/video99 --timeout 0", "--timeout 0; expected seconds, above 0"),
+        ("/dev/video99 --moved drive.csv", "is live; expected a file with it, or LiveLocalizer"),
+        ("sim:aerial?frames=20 --moved lost.csv", "lost.csv"),
+        ("sim:aerial?frames=20 --metres_per_place 2", "2 metres a place, and no moves"),
         (
             "sim:aerial?frames=20 --lag 5 --match single",
             "--lag 5 with --match single; expected --match filter",
@@ -232,13 +236,40 @@ def test_mistakes_are_one_line(words, told, folder, capsys):
     assert told in fails(capsys, "live", folder / "map.safetensors", *words.split())
 
 
+@pytest.mark.parametrize("dropped", [False, True])
+def test_a_file_with_odometry(dropped, folder, tmp_path, capsys, monkeypatch):
+    """The way that frames have gone adds up over those that are dropped."""
+    import dejavu_torch.cli.live as command
+
+    model, video = DejaVu.load(folder / "map.safetensors"), open_source(folder / "second.mkv")
+    moved = [0.5 + i % 3 for i in range(len(video))]
+    (tmp_path / "moved.csv").write_text(
+        "\n".join(["moved_m,moved_spread", *(f"{2 * one},{0.1 * one}" for one in moved)])
+    )
+    some = [*range(0, 20, 3 if dropped else 1)]
+    original = command.shots_of
+    monkeypatch.setattr(
+        command, "shots_of", lambda traverse: (one for one in original(traverse) if one.number in some)
+    )
+    options = "--moved", tmp_path / "moved.csv", "--metres_per_place", 2
+    run("live", folder / "map.safetensors", folder / "second.mkv", *options)
+    found = [line["place"] for line in lines_of(capsys.readouterr().out)]
+    localizer, expected, before = LiveLocalizer(model, PlaceFilter()), [], None
+    for i in some:
+        passed = range(i + 1) if before is None else range(before + 1, i + 1)
+        way = sum(moved[j] for j in passed), sum((0.05 * moved[j]) ** 2 for j in passed) ** 0.5
+        expected.append(localizer(video[i], moved=None if before is None else way).place)
+        before = i
+    assert found == expected
+
+
 def test_a_file_is_opened_once(folder, monkeypatch):
     import dejavu_torch.cli.live as command
 
     opened = []
     monkeypatch.setattr(command, "open_source", lambda source: opened.append(source) or open_source(source))
     frames, *_ = command.frames_from(
-        str(folder / "second.mkv"), DejaVu.load(folder / "map.safetensors"), False
+        str(folder / "second.mkv"), DejaVu.load(folder / "map.safetensors"), False, False, None, DRIVES
     )
     assert next(iter(frames)).pixels.shape[-2:] == DejaVu.load(folder / "map.safetensors").frame_shape[1:]
     assert len(opened) == 1

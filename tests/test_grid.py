@@ -318,7 +318,7 @@ def test_latitudes_are_those_of_the_map(geotiff, tmp_path):
     grid = open_source(f"grid:{geotiff(ground(100, 140), at=(500_000, 5_300_000))}?window=20&stride=20")
     (tmp_path / "photos.csv").write_text("lat,lon\n47.85,9.0005\nnan,nan\n")
     own = ArrayTraverse(torch.zeros(2, 20, 20, dtype=torch.uint8))
-    own.coordinates, _ = read_coordinates(tmp_path / "photos.csv", own)
+    own.coordinates, *_ = read_coordinates(tmp_path / "photos.csv", own)
     stored, asked = coordinates_of([grid, own], "metres")
     assert asked[0].tolist() == pytest.approx([500_037.4, 5_299_628.6], abs=0.1)  # 9 degrees east are 500 km
     assert asked[1].isnan().all()

@@ -63,8 +63,9 @@ def test_the_first_of_several_places_has_the_probability(flights, tmp_path, word
     run("localize", flights, AGAIN, *words, "--out", best)
     run("localize", flights, AGAIN, *words, "--top", "4", "--out", top)
     alone, rows = rows_of(best), rows_of(top)
-    columns = ["query", "place", "score", "accepted", "probability", "confidence", "stale", "rank"]
-    assert list(rows[0]) == [*columns, "query_name", "place_name"]
+    columns = ["query", "place", "score", "accepted", "probability", "confidence", "stale"]
+    columns += ["speed"] * ("--filter" not in words)  # of whole drives
+    assert list(rows[0]) == [*columns, "rank", "query_name", "place_name"]
     assert [int(row["rank"]) for row in rows] == [1, 2, 3, 4] * 96
     assert [{**row, "rank": "1"} for row in alone] == rows[::4]
     others = [row for row in rows if row["rank"] != "1"]

@@ -22,9 +22,9 @@ from dejavu_torch.live.feed import FrameReader, in_real_time
 from dejavu_torch.live.localizer import LiveLocalizer, LiveMatch
 from dejavu_torch.live.page import Page, ReferencePictures, Snapshot, without_nan
 from dejavu_torch.model import DejaVu
-from dejavu_torch.recognition.querying import SEQUENCES, Sequences
+from dejavu_torch.recognition.querying import DRIVES, Drives
 from dejavu_torch.text import printable
-from dejavu_torch.types import InputError, SequenceModel, expect
+from dejavu_torch.types import InputError, Odometer, SequenceModel, expect
 
 RECENT = 10_000  # answers whose times are kept
 RATE = 10  # frames per second on the page, for a source without times
@@ -52,7 +52,7 @@ def follow(
     realtime: bool = False,
     timeout: float = 10.0,
     centre: bool = False,
-    looking: Sequences = SEQUENCES,
+    asked: Drives = DRIVES,
 ) -> None:
     """Localize the frames of a source until it ends or Ctrl-C; see `run_live`.
 
@@ -62,8 +62,9 @@ def follow(
     Raises:
         InputError: the source fails; the lines and the summary of earlier frames are printed first.
     """
-    frames, newest, name, turned = frames_from(source, model, realtime, port is not None)
-    localizer = LiveLocalizer(model, sequence, port is not None, centre, turned, looking)
+    shown = port is not None
+    frames, newest, name, turned, odometer = frames_from(source, model, realtime, shown, sequence, asked)
+    localizer = LiveLocalizer(model, sequence, shown, centre, turned, asked)
     title += f"; answers come {localizer.lag} frames later and use these" if localizer.lag else ""
     recent: deque[float] = deque(maxlen=RECENT)  # milliseconds
     waiting: deque[Frame] = deque()  # for their answers
@@ -98,7 +99,10 @@ def follow(
                 latest = -1
                 try:
                     for frame in reader:
-                        matches = localizer.due(frame.pixels, frame.number - latest - 1)
+                        moved = None
+                        if odometer is not None and latest >= 0:
+                            moved = odometer.between(latest, frame.number)
+                        matches = localizer.due(frame.pixels, frame.number - latest - 1, moved)
                         latest = frame.number
                         waiting.append(frame)
                         tell(matches)
@@ -126,9 +130,10 @@ def _stay(url: str) -> None:
 
 
 def frames_from(
-    source: str, model: DejaVu, realtime: bool, shown: bool = False
-) -> tuple[Iterable[Frame], bool, str, bool]:
-    """The frames of a source, whether older ones are dropped, its name, and whether they are turned north.
+    source: str, model: DejaVu, realtime: bool, shown: bool, sequence: SequenceModel | None, asked: Drives
+) -> tuple[Iterable[Frame], bool, str, bool, Odometer | None]:
+    """The frames of a source, whether older ones are dropped, its name, whether they are turned north, and
+    what an odometer reads at them.
 
     Args:
         shown: on a page, for which a file is played in real time.
@@ -138,18 +143,21 @@ def frames_from(
     if is_stream(source):
         camera = Camera(source, size)
         expect(not realtime, "a video file with it", f"--realtime: {camera.name} is live already")
-        return _with_warning(camera), True, camera.name, False
+        told = "a file with it, or LiveLocalizer(...)(frame, moved=...) in Python"
+        expect(asked.moved is None, told, f"--moved {asked.moved}: {camera.name} is live")
+        return _with_warning(camera), True, camera.name, False, None
     traverse = open_source(source)
     own = traverse.frame_shape[1:]
     if size is not None and len(own) == 2 and own != size and not traverse.sized:
         if note := stretched(traverse.name, own, size):
             log.warning("%s", note)
         traverse = at_size(traverse, size)
+    moved = model.moved(traverse, asked, sequence)
     traverse = facing_north(traverse, model.map.layout)
     frames = shots_of(traverse)
     if realtime or shown:
         frames = in_real_time(frames, traverse.name, None if realtime else RATE)
-    return frames, realtime, traverse.name, isinstance(traverse, Turned)
+    return frames, realtime, traverse.name, isinstance(traverse, Turned), moved
 
 
 def _with_warning(camera: Camera) -> Iterable[Frame]:
@@ -165,9 +173,8 @@ def line_of(image: Frame, match: LiveMatch) -> str:
     names = ("place", "frame", "route", "x", "y", "shift", "shift_degrees", "stale")
     place, frame, route, x, y, shift, turn, stale = (answer.pop(name) for name in names)
     facts = {"frame": image.number, "time": image.seconds, "place": place, "reference_frame": frame, **answer}
-    facts |= {} if math.isnan(x) else {"x": x, "y": y}
-    facts |= {} if math.isnan(shift) else {"shift": round(shift, 4)}
-    facts |= {} if math.isnan(turn) else {"shift_degrees": round(turn, 2)}
+    numbers = {"x": x, "y": y, "shift": round(shift, 4), "shift_degrees": round(turn, 2)}
+    facts |= {name: number for name, number in numbers.items() if not math.isnan(number)}
     facts |= {"stale": stale} if stale else {}
     return json.dumps(without_nan(facts | ({"route": route} if route else {})))
 

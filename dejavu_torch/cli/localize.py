@@ -70,7 +70,7 @@ def run_localize(
         skip_damaged: go on if frames cannot be read; they find nothing
     """
     device_of(loading.device)
-    _check_written(out, pairs, map, source)
+    _check_written(out, pairs, map, source, str(querying.moved or ""))
     querying.check_loops(cluster=cluster)
     matcher = querying.matcher(SUPPRESSION, acceptance.threshold)
     ordered = querying.order(matcher)

@@ -28,14 +28,14 @@ from dejavu_torch.model import DejaVu, check_precision
 from dejavu_torch.model_file import NO_MAP, recipe_of
 from dejavu_torch.recognition.coarse import searcher
 from dejavu_torch.recognition.filter import PlaceFilter
-from dejavu_torch.recognition.querying import Querying, Sequences
+from dejavu_torch.recognition.querying import Drives, Querying
 from dejavu_torch.recognition.search import Search, check_search
 from dejavu_torch.text import refuse_with
 from dejavu_torch.types import InputError, SequenceModel, Traverse, expect
 
 
 @dataclass(frozen=True)
-class LiveSequences(Sequences):
+class LiveSequences(Drives):
     """How frames are matched.
 
     Args:
@@ -75,12 +75,9 @@ class LocalQuerying(Querying):
     Args:
         fov: horizontal field of view of the camera in degrees: tell by how many of them it points further
             right than at learning
-        moved: odometry, for a drive or a filter: csv with a column moved, in places since the frame before,
-            and a row for each frame
     """
 
     fov: float | None = None
-    moved: Path | None = None
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from dejavu_torch.data.files import as_number
@@ -20,7 +21,7 @@ from dejavu_torch.data.fixes import checked_fixes
 from dejavu_torch.data.folder import natural
 from dejavu_torch.data.geotiff import from_degrees
 from dejavu_torch.data.tables import Table, number, read_table, whole
-from dejavu_torch.types import Coordinates, InputError, Traverse, expect
+from dejavu_torch.types import Coordinates, InputError, Odometer, Traverse, expect
 
 log = logging.getLogger("dejavu_torch")
 
@@ -33,6 +34,7 @@ EXPECTED = (
     "a csv with the columns x,y or lat,lon, and name or time where rows are not frames; poses of KITTI, "
     "12 numbers a line; or of TUM or EuRoC, with times"
 )
+MOVED = "a csv with a column moved, in places, or moved_m, and a row for each frame, or names or times"
 PAIRS = ("x", "y"), ("lat", "lon"), ("easting", "northing")  # columns
 UNITS = (1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3)  # times above are in nano-, micro- or milliseconds
 OF_MAPS = re.compile(r"EPSG:|.*\[")  # coordinate systems, by number or as text; not pixels
@@ -99,10 +101,10 @@ def coordinates_of(traverses: Sequence[Traverse], kind: Kind) -> list[Tensor]:
     return [own.upright()[:, :2] for own in known]
 
 
-def read_coordinates(path: Path, traverse: Traverse) -> tuple[Coordinates, Tensor | None]:
+def read_coordinates(path: Path, traverse: Traverse) -> tuple[Coordinates, Tensor | None, Odometer | None]:
     """Where the frames of a traverse were taken, from a file of one row a frame, or with names, times or
-    numbers of frames; and their headings (N,) in degrees, if there are any. What is no place is told and
-    left out, see `checked_fixes`.
+    numbers of frames; their headings (N,) in degrees, and what an odometer reads, if the file tells. What is
+    no place is told and left out, see `checked_fixes`.
 
     Args:
         path: a table whose header has x,y[,z], easting,northing or lat,lon, and may have `name`, of images,
@@ -111,7 +113,7 @@ def read_coordinates(path: Path, traverse: Traverse) -> tuple[Coordinates, Tenso
             commas, in nanoseconds). Times are compared with those of a video, or with image names that are
             times; both in seconds, or in the unit that their size tells. Between rows up to a second apart
             coordinates are interpolated. A column `heading` has degrees clockwise from
-            north, or from the upper side of a picture.
+            north, or from the upper side of a picture; for `moved` see `read_odometer`.
 
     Raises:
         InputError: another file, or rows that fit no frames.
@@ -133,12 +135,14 @@ def read_coordinates(path: Path, traverse: Traverse) -> tuple[Coordinates, Tenso
     lines = [table.rows[row][0] for row in order]
     values[order, :dimensions], seen = checked_fixes(values[order, :dimensions], degrees, lines)
     values = _of_frames(table, values, traverse)
+    odometer = None
+    try:
+        odometer = read_odometer(table, traverse) if "moved" in table else None
+    except InputError as error:
+        seen.append(f"the column moved is not used: {error}")
     if unused := table.unused():
-        seen.append(
-            f"the columns {', '.join(unused)} are not used"
-            if unused[1:]
-            else f"the column {unused[0]} is not used"
-        )
+        many, are = ("s", "are") if unused[1:] else ("", "is")
+        seen.append(f"the column{many} {', '.join(unused)} {are} not used")
     for line in seen:
         log.warning("%s: %s", path, line)
     headings = torch.from_numpy(values[:, -1].copy() % 360) if turns else None
@@ -150,7 +154,40 @@ def read_coordinates(path: Path, traverse: Traverse) -> tuple[Coordinates, Tenso
     if headings is not None and (unknown := int(headings.isnan().sum())):
         log.warning("%s: %d of %d frames have no heading", traverse.name, unknown, len(traverse))
         headings = None if unknown == len(headings) else headings
-    return Coordinates(torch.from_numpy(values), degrees, height=height), headings
+    return Coordinates(torch.from_numpy(values), degrees, height=height), headings, odometer
+
+
+def read_odometer(table: Table, traverse: Traverse) -> Odometer:
+    """What an odometer reads at the frames of a traverse, from rows as `read_coordinates` takes them: `moved`
+    is how far the camera moved since the row before, in places, or in metres, as in moved_m or "moved [cm]";
+    `moved_spread` its standard deviation, in the same unit. Raises an InputError if it is another table."""
+    expect("moved" in table and table.rows, MOVED, f"{table}, and {len(table)} rows")
+    roles = [role for role in ("moved", "moved_spread") if role in table]
+    columns = [table.header[table.at(role)] for role in roles]
+    table = table.distinct() if "time" in table else table
+    unit, titles = columns[0].unit, " and ".join(column.title for column in columns)
+    expect(columns[-1].unit in (None, unit), "one unit", f"{table.path} has the columns {titles}")
+    cells = [table.text(role) for role in roles]
+    found = np.array([[number(cell) for cell in column] for column in cells]).T
+    found[0] = 0  # there is no row before the first
+    for row, column in np.argwhere(~(found >= 0))[:1]:
+        seen = f"{table.where(row)}: {columns[column].title} is {cells[column][row]!r}"
+        raise InputError(f"{seen}; expected a number of at least 0")
+    read = np.full((len(table), 2), math.nan)
+    read[:, : len(roles)] = (((unit or 1.0) * found) ** (1, 2)[: len(roles)]).cumsum(0)
+    return Odometer(torch.from_numpy(_of_frames(table, read, traverse)), unit is not None)
+
+
+def odometer_of(traverse: Traverse) -> Odometer:
+    """What an odometer would read at frames by their coordinates, even where some have none; an InputError
+    without any in metres or degrees."""
+    own, expected = traverse.coordinates, "those of 'SOURCE?coordinates=FILE', in metres or degrees"
+    expect(own is not None and own.frame != "pixels", expected, f"{traverse.name} without coordinates")
+    (at,) = coordinates_of([traverse], "metres")
+    known = ~at.isnan().any(1)
+    way = F.pad(at[known].diff(dim=0).norm(dim=1), (1, 0)).cumsum(0)
+    even = np.interp(np.arange(len(at)), known.nonzero()[:, 0], way, math.nan, math.nan)
+    return Odometer(torch.from_numpy(np.stack([even, np.full(len(at), math.nan)], 1)), True)
 
 
 def _columns(table: Table) -> tuple[list[int], bool, int]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import re
 import stat
 import warnings
 from collections.abc import Iterator
@@ -73,7 +74,8 @@ def read_rows(path: Path, expected: str) -> list[tuple[int, list[str]]]:
     lines = read_text(path, expected).splitlines()
     cells = (line for line in lines if line[:1] != "#")
     separator = next((sign for line in cells for sign in ";\t," if sign in line), " ")
-    lines = [line.rstrip() for line in lines] if separator == " " else lines
+    if separator == " ":  # a unit stays with its name, as in "moved [m]"
+        lines = [re.sub(r" +(?=[\[(]\w+[\])])", "", line.rstrip()) for line in lines]
     reader = csv.reader(lines, delimiter=separator, skipinitialspace=True)
     try:
         rows = [(reader.line_num, [cell.strip() for cell in row]) for row in reader]

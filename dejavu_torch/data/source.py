@@ -105,7 +105,7 @@ def open_source(source: str | Path) -> Traverse:
     file, turn, crop, mask = (arguments.pop(name, "") for name in ("coordinates", "turn", "crop", "mask"))
     traverse = reader(**arguments)
     if file:
-        traverse.coordinates, headings = read_coordinates(Path(file), traverse)
+        traverse.coordinates, headings, traverse.odometer = read_coordinates(Path(file), traverse)
         traverse.headings = traverse.headings if headings is None else headings
     if turn:
         traverse = Upright(traverse, turn)

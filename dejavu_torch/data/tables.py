@@ -29,6 +29,8 @@ ALIKE = {
     "lon": "longitude lng long",
     "easting": "east utm_east utm_easting utm_x",
     "northing": "north utm_north utm_northing utm_y",
+    "moved": "",
+    "moved_spread": "",
 }
 UNITS = {"s": 1.0, "sec": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9}  # of times, in seconds
 UNITS |= {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "km": 1e3, "deg": 1.0, "degrees": 1.0, "rad": 180 / math.pi}

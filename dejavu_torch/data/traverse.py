@@ -45,9 +45,9 @@ class Part(Traverse):
             None if values is None else values[torch.as_tensor(frame)]
             for values in (traverse.times, traverse.places, traverse.headings)
         )
-        if traverse.coordinates is not None:
-            values = traverse.coordinates.values[torch.as_tensor(frame)]
-            self.coordinates = traverse.coordinates._replace(values=values)
+        for name in ("coordinates", "odometer"):
+            if (known := getattr(traverse, name)) is not None:
+                setattr(self, name, known._replace(values=known.values[torch.as_tensor(frame)]))
         if isinstance(frame, range) and frame == range(len(traverse)):
             self.layout = traverse.layout
         if traverse.cut is not None and isinstance(frame, range):

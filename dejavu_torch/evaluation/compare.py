@@ -55,7 +55,9 @@ from dejavu_torch.motion.resampling import ground_truth_of, resampled, source_of
 from dejavu_torch.places.layout import Reach
 from dejavu_torch.recognition.centring import centred
 from dejavu_torch.recognition.evidence import passed_of
+from dejavu_torch.recognition.large import is_large
 from dejavu_torch.recognition.localizer import Matching, answer
+from dejavu_torch.recognition.odometry import moves_of
 from dejavu_torch.recognition.querying import QUERYING, Querying
 from dejavu_torch.recognition.scorer import Repeated, Scorer
 from dejavu_torch.recognition.select import check_candidates
@@ -268,6 +270,8 @@ def _prepared(
 ) -> tuple[Traverse, Traverse, list[Traverse]]:
     """The reference, the query and routes off the map, at the map's size and at even steps."""
     loops, has_map, progress = querying.loops, model.map.places > 0, reporting.progress
+    if query is not None:
+        moves_of(query, querying.moved, querying.metres_per_place)  # refuses what cannot be read
     if loops is not None:
         check_loops_along(reference.layout)
     off = reporting.off_map([reference] if query is None else [reference, query])
@@ -334,10 +338,13 @@ def _answered(plan: Plan, run: Localization) -> tuple[Localization, Match, Match
         querying = model.looking(run.query, plan.querying, plan.ordered, plan.centring and not causal)
     run = run._replace(querying=querying)
     matching, whole, beside = plan.ways(run)
+    moved = None if querying.loops is not None else model.moved(run.query, querying, plan.way)
+    whole_moved = None if is_large(len(run.query), model.map.places) else moved
+    matching, beside = matching._replace(moved=moved), beside and beside.changed(moved=whole_moved)
     ranks = max(querying.ranks, min(max(RANKS), model.map.places))
 
     def found(scorer: Scorer, own: Matching) -> Match:
-        own = own._replace(k=ranks, radius=run.tolerance, wrappers=querying.wrappers)
+        own = own._replace(k=ranks, radius=run.tolerance, wrappers=querying.wrappers, moved=matching.moved)
         return answer(scorer, own, progress)
 
     with timed(plan.seconds, "localize"):

@@ -79,7 +79,7 @@ def _run_facts(run: Localization, seconds: Mapping[str, float]) -> Facts:
         **_gap_facts(run),
     }
     if smoother is not None:
-        facts["drive"] = drive = smoother.settled()
+        facts["drive"] = drive = smoother.settled() | {"speed": _median(run.match.speed)}
         if run.truth is not None:
             block = math.ceil(drive["correlation"])
             drive["auc_error"] = auc_error(run.scored, run.truth, run.tolerance, block)
@@ -122,9 +122,12 @@ def view_facts(run: Localization) -> Facts:
         return {}
     own = zip(best.kept.tolist(), best.penalties[0].tolist(), strict=True)
     penalties = {f"{best.shifts[copy]:g}": round(penalty, 4) for copy, penalty in own}
-    shift = run.match.shift
-    known = [] if shift is None else shift[~shift.isnan()].sort().values.tolist()
-    return {"views": {"penalties": penalties, "shift": known[len(known) // 2] if known else None}}
+    return {"views": {"penalties": penalties, "shift": _median(run.match.shift)}}
+
+
+def _median(column: Tensor | None) -> float | None:
+    known = [] if column is None else column[~column.isnan()].sort().values.tolist()
+    return known[len(known) // 2] if known else None
 
 
 def metric_facts(run: Localization, truth: Truth | None) -> Facts:

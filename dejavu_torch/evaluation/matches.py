@@ -25,7 +25,8 @@ from dejavu_torch.types import InputError, Match, expect
 
 log = logging.getLogger("dejavu_torch")
 
-TOLD = "probability", "confidence", "heading", "shift", "shift_degrees", "stale"  # if they are known
+KNOWN = "probability", "confidence", "heading", "shift", "shift_degrees", "stale", "speed"  # if they are
+DIGITS = {"shift": 3, "shift_degrees": 3, "speed": 3}
 NUMBERS, NAMES = ("query", "place", "score", "accepted"), ("query_name", "place_name")
 EXPECTED = "columns query,place,score and optionally accepted, probability, confidence, rank, route"
 ELSEWHERE = -2  # the place of an answer on another route
@@ -79,7 +80,7 @@ def write_matches(
     matches = iter(matches)
     start = next(matches, None)
     present = {} if start is None else start.columns
-    known = [name for name in TOLD if name in present]
+    known = [name for name in KNOWN if name in present]
     with ExitStack() as stack:
 
         def opened(path: Path) -> TextIO:
@@ -97,24 +98,19 @@ def write_matches(
             queries = torch.arange(first, total) if query_frames is None else query_frames[first:total]
             places, own = table.frame_of(match.index), table.own_frame_of(match.index)
             rank = torch.arange(each).repeat(len(queries)) + 1
-            right, sure, turn, aside, by, again = (match.columns.get(name, match.score) for name in TOLD)
+            told = (match.columns.get(name, match.score) for name in known)
             route, at = layout.route_of(match.index), layout.coordinates(match.index)
             whole = queries.repeat_interleave(each), places, own, match.accepted, rank, route
-            parts = match.score, right, sure, turn, aside, by, again, *at.unbind(1)
+            parts = match.score, *told, *at.unbind(1)
             rows = (zip(*(one.tolist() for one in columns), strict=True) for columns in (whole, parts))
             for (query, place, number, good, order, on), own in zip(*rows, strict=True):
-                score, chance, margin, north, shift, by, again, x, y = own
+                score, *numbers, x, y = own
                 row = {
                     "query": query,
                     "place": number,
                     "score": f"{score:.{digits}g}",
                     "accepted": int(good),
-                    "probability": _probability(chance),
-                    "confidence": _number(margin),
-                    "heading": _number(north),
-                    "shift": _number(shift, 3),
-                    "shift_degrees": _number(by, 3),
-                    "stale": _number(again),
+                    **{name: _told(name, one) for name, one in zip(known, numbers, strict=True)},
                     "rank": order,
                     "route": printable(layout.names("")[on]) if on >= 0 else "",
                     "x": _number(x, 9),
@@ -129,9 +125,10 @@ def write_matches(
     return total, accepted
 
 
-def _probability(value: float) -> str:
-    """As many digits as tell how far it is from 1."""
-    return _number(value, 6 - round(math.log10(max(1 - value, 1e-9))) if value > 0.5 else 6)
+def _told(name: str, value: float) -> str:
+    """With its digits; of a probability as many as tell how far it is from 1."""
+    sure = name == "probability" and value > 0.5
+    return _number(value, 6 - round(math.log10(max(1 - value, 1e-9))) if sure else DIGITS.get(name, 6))
 
 
 def _number(value: float, digits: int = 6) -> str:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import time
-from typing import Literal, NamedTuple
+from collections.abc import Sequence
+from typing import Literal, NamedTuple, TypeAlias
 
 import numpy as np
 import torch
@@ -22,13 +23,16 @@ from dejavu_torch.recognition.centring import running_mean, set_apart
 from dejavu_torch.recognition.filter import PlaceFilter
 from dejavu_torch.recognition.querying import SEQUENCES, Sequences
 from dejavu_torch.recognition.views import ALONE
-from dejavu_torch.types import InputError, Match, SequenceModel, check_shape, expect
+from dejavu_torch.types import Facts, InputError, Match, SequenceModel, check_shape, expect
 
 EXPECTED = "uint8 (H,W), (H,W,3) or (3,H,W), or float in [0, 1], or float (D,) for a map of ready features"
 DTYPES = ("uint8", "float16", "bfloat16", "float32", "float64")
 SMALL = (HOG, Distilled, PatchPixels)  # features that one thread computes as fast as several
 MAX_SKIPPED = 100  # skipped frames that a filter moves for; after more, a jump finds the place again
+# columns of a match, and what stands for those that are not known
+TOLD = {"accepted": True, "stale": 0, **dict.fromkeys(("probability", "shift", "shift_degrees"), math.nan)}
 ROUNDING = 1e-3  # tolerance of the range [0, 1]
+Move: TypeAlias = "float | Sequence[float] | Tensor | None"  # places, or these and their standard deviation
 
 
 class LiveMatch(NamedTuple):
@@ -70,10 +74,10 @@ class LiveLocalizer:
         of a drive know no views yet. A refused frame changes nothing.
         `left_out` in `localizer(frame, left_out, moved)` is the number of frames skipped before this one: a
         `PlaceFilter` moves once more for each. `moved` is how many places the camera moved since the frame
-        before, if odometry tells it; then the number of skipped frames does not count. With a `PlaceFilter`
-        that has a lag, `due(frame, left_out, moved)` gives the answers that this frame completes, none or
-        one, in the order of the frames, and `finish()` those that are left at the end; without a lag `due`
-        has the answer of the frame itself.
+        before, as odometry tells, or (places, standard deviation); then the number of skipped frames does not
+        count. With a `PlaceFilter` that has a lag, `due(frame, left_out, moved)` gives the answers that this
+        frame completes, none or one, in the order of the frames, and `finish()` those that are left at the
+        end; without a lag `due` has the answer of the frame itself.
 
     Raises:
         InputError: no map, or one of even steps along the ground; a frame of another type, shape or range;
@@ -127,25 +131,22 @@ class LiveLocalizer:
     def _keep(self, scores: Tensor) -> None:
         self.scores = scores[-1] if len(scores) else self.scores
 
-    def __call__(
-        self, frame: Tensor | np.ndarray, left_out: int = 0, moved: float | None = None
-    ) -> LiveMatch:
+    def __call__(self, frame: Tensor | np.ndarray, left_out: int = 0, moved: Move = None) -> LiveMatch:
         expect(not self.lag, "due(frame)", f"an answer for each frame with a lag of {self.lag}")
         return self.due(frame, left_out, moved)[0]
 
     @torch.no_grad()
-    def due(
-        self, frame: Tensor | np.ndarray, left_out: int = 0, moved: float | None = None
-    ) -> list[LiveMatch]:
+    def due(self, frame: Tensor | np.ndarray, left_out: int = 0, moved: Move = None) -> list[LiveMatch]:
         """The answers that a frame completes: its own, or that of the frame `lag` before, if there is one."""
-        if moved is not None:
-            expect(self._filters, "a PlaceFilter", f"moved {moved:g} without a filter")
+        told = torch.as_tensor([] if moved is None else moved, dtype=torch.float64).view(-1)
+        if len(told):
+            expect(self._filters, "a PlaceFilter", f"moved {told[0]:g} without a filter")
             self.model.map.layout.expect_route("a route", "moved, and the map of an area")
-            odometry.check_move(moved)
+            odometry.check_move(float(told[0]))
         with self._localizer.alone_asked():
-            return self._due(frame, left_out, moved)
+            return self._due(frame, left_out, told)
 
-    def _due(self, frame: Tensor | np.ndarray, left_out: int, moved: float | None) -> list[LiveMatch]:
+    def _due(self, frame: Tensor | np.ndarray, left_out: int, moved: Tensor) -> list[LiveMatch]:
         start, mean, latest = time.perf_counter(), self._mean, self._latest
         batch = as_batch(frame, self.model.map.device)
         with in_one_thread(batch.numel() if self._small else math.inf):
@@ -159,10 +160,10 @@ class LiveLocalizer:
                 raw, (descriptor, mean) = descriptor, self.centring(descriptor, mean, len(descriptor))
                 latest = raw, descriptor
         with in_one_thread(self.model.map.places):
-            if moved is None:
-                self._localizer.skip(min(left_out, MAX_SKIPPED))
-            else:
+            if len(moved):
                 self._localizer.told(moved)
+            else:
+                self._localizer.skip(min(left_out, MAX_SKIPPED))
             match = self._localizer(descriptor)
         self._mean, self._latest = mean, latest
         return self._told(match, start)
@@ -191,23 +192,19 @@ class LiveLocalizer:
         place, score, table = int(match.index), float(match.score), model.map.table
         shown, layout = int(table.frame_of(match.index)), model.map.layout
         x, y = layout.coordinates(match.index).tolist()
-        stale = 0 if match.stale is None else int(match.stale)
-        probability = math.nan if match.probability is None else float(match.probability)
+        columns = {name: column.item() for name, column in match.columns.items()}
+        told: Facts = {name: columns.get(name, missing) for name, missing in TOLD.items()}
         return LiveMatch(
             place=place,
             frame=int(table.own_frame_of(match.index)),
             name=model.frame_names[shown] if model.frame_names and shown >= 0 else "",
             score=score,
             posterior=math.exp(-score) if self._filters else math.nan,
-            probability=probability,
-            accepted=bool(match.accepted),
             milliseconds=milliseconds,
             route=layout.names("")[int(layout.route_of(match.index))] if place >= 0 else "",
             x=x,
             y=y,
-            shift=math.nan if match.shift is None else float(match.shift),
-            shift_degrees=math.nan if match.shift_degrees is None else float(match.shift_degrees),
-            stale=stale,
+            **told,
         )
 
     @property

@@ -69,6 +69,7 @@ USUAL, BACK = 0.4, 0.1  # shares of the cameras that pass place by place; agains
 # Odometry: the share of the places that it misses, or counts twice; .1, .2 and .3 were compared with odometry
 # made from the truth of twelve routes of `drives`, 10 % of noise or 10 % too large: noise asks for less.
 ODOMETRY = 0.1
+PACES = tuple(0.25 * 1.2**i for i in range(18))  # places a query, one of which odometry in metres shows
 SCALES = 1.0, 0.95, 1.05, 0.9, 1.1, 0.85, 1.15  # of which a whole drive shows one
 
 # Over areas, on `areas`: among so many windows a right one has to stand out more than along a route.

@@ -37,6 +37,7 @@ from dejavu_torch.types import Match, expect
 
 SCORES_KEPT = 2**26  # scores of drives that are smoothed together, up to which they are computed once
 FEWER = "a route of fewer places, or, along one, a filter"
+AROUND = 5  # queries, whose answers tell the speed
 NORMAL = 1.4826  # standard deviations of a Gaussian over its median absolute deviation
 
 
@@ -191,6 +192,8 @@ def _joined(asked: DriveQuery, parts: list[Shown]) -> Answers:
     confidences = first_of(sure.to(own.dtype), k)
     match = replace(match, probability=first_of(probability, k), confidence=confidences)
     stale = None if asked.stale is None else asked.stale[:, None].expand_as(match.index)
+    if asked.answers and not asked.scorer.layout.axes:
+        match = replace(match, speed=first_of(speed_of(match.index[:, 0], probability), k))
     return Answers(replace(match, smoother=asked.smoother, stale=stale), absent)
 
 
@@ -274,6 +277,13 @@ def doubt(own: Tensor) -> Tensor:
     deviation = NORMAL * (known - median).abs().median()
     worse = (own - median) / deviation.clamp(min=1e-12)
     return chosen.DOUBT * worse.nan_to_num(0, 0, 0).clamp(0, 1 / chosen.DOUBT**2)
+
+
+def speed_of(places: Tensor, probability: Tensor) -> Tensor:
+    """Places a query that a drive goes at its answers (Q,), by those up to `AROUND` before and after."""
+    at = F.pad(places.double().masked_fill(probability < 0.5, math.nan), (AROUND, AROUND), value=math.nan)
+    steps = at.diff().unfold(0, 2 * AROUND, 1)
+    return steps.where(steps.abs() <= 2 * chosen.PACES[-1], math.nan).nanmean(1)
 
 
 def first_of(column: Tensor, k: int) -> Tensor:

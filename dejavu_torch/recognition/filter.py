@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from fractions import Fraction
+from functools import cache, partial
 from typing import NamedTuple
 
 import torch
@@ -58,8 +59,8 @@ class FilterState(NamedTuple):
         posterior: (N+1,), of the latest answer, which with a lag depends on later queries as well.
         learned: what the queries so far tell, if the filter learns.
         waiting: (R,N), scores of the queries that wait for their answers.
-        left_out: after each of these, how many queries were left out. told: (R,2), how much speaks for being
-            off the map, and places moved, NaN where unknown; see `PlaceFilter.step`.
+        left_out: after each of these, how many queries were left out. told: (R,3), how much speaks for being
+            off the map, places moved and their spread, NaN where unknown; see `PlaceFilter.step`.
         ahead: (), of a place, by which the camera is ahead of whole places moved.
         counts: (bins,), best scores so far, see `Nearness`.
     """
@@ -185,7 +186,7 @@ class PlaceFilter(SequenceModel):
         new = self.off_map.detach().new_zeros
         kind, moves, states = self._learned, len(self.move_logits), self._states(places)
         learned = None if kind is None else kind.unpacked(new(kind.size(places, moves)), places, moves)
-        none = new(0, places), (), new(0, 2), torch.zeros((), dtype=torch.float64)
+        none = new(0, places), (), new(0, 3), torch.zeros((), dtype=torch.float64)
         return FilterState(new(states), new(places + 1), learned, *none, new(self.counted))
 
     @property
@@ -216,7 +217,7 @@ class PlaceFilter(SequenceModel):
         places, rows = self._places(state.shape[-1]), state.reshape(-1, state.shape[-1])
         kind, learned = self._learned, rows[1:].flatten()
         known = None if kind is None else kind.unpacked(learned, places, len(self.move_logits))
-        none = state.new_zeros(0, places), (), state.new_zeros(0, 2), state.new_zeros(())
+        none = state.new_zeros(0, places), (), state.new_zeros(0, 3), state.new_zeros(())
         return FilterState(rows[0], state.new_zeros(places + 1), known, *none, counts)
 
     def forward(self, scores: Tensor, before: Tensor | None = None) -> Tensor:
@@ -256,19 +257,21 @@ class PlaceFilter(SequenceModel):
         route_starts: Sequence[int] = (0,),
         last: bool = False,
         absent: Tensor | None = None,
-        moved: Tensor | None = None,
+        moved: Tensor | tuple[Tensor, Tensor | float] | None = None,
     ) -> tuple[Tensor, FilterState]:
         """As of every `SequenceModel`.
 
         Args:
             last: no queries follow, so all that wait are answered. absent: (B,), nats that speak for being
                 off the map, by what is known of each query beside its scores; none by default.
-            moved: (B,), places from the query before to each, as odometry tells, NaN where unknown; along a
-                route.
+            moved: (B,), places from the query before to each, as odometry tells, NaN where unknown, or these
+                and their standard deviation, (B,) or (); along a route.
         """
         told: Tensor | None = None  # neither in an exported graph
         if absent is not None or moved is not None:
-            told = torch.stack([_or(absent, len(scores), 0.0), _or(moved, len(scores), math.nan)], 1)
+            places, spread = moved if isinstance(moved, tuple) else (moved, None)
+            own = (absent, 0.0), (places, math.nan), (spread, math.nan)
+            told = torch.stack([_or(one, len(scores), default) for one, default in own], 1)
         posteriors, answered, state = self._answers(scores, state, route_starts, last, told)
         return self.near(posteriors[:, :-1], answered), state
 
@@ -328,20 +331,20 @@ class PlaceFilter(SequenceModel):
             own = f"({places + 1},), and {self._states(places)} states, for this map and filter"
             raise InputError(f"{shapes}; expected {own}")
         belief, posterior, learned, waiting, left, known, camera, counts = state.to(scores)
-        unknown = scores.new_tensor([0.0, math.nan]).expand(len(scores), 2)
+        unknown = scores.new_tensor([0.0, math.nan, math.nan]).expand(len(scores), 3)
         odometry_known = told is not None or len(known) > 0
         left_out, new = (*left, *[0] * len(scores)), scores
         scores = torch.cat([waiting, scores]) if len(waiting) else scores
         moments, motion = moments_of(scores), self.motion(scores, route_starts, learned)
         nats, counts = self._nearness.after(new, moments.varied[len(waiting) :, 0], counts)
-        told = (unknown if told is None else told.to(scores)) + F.pad(nats[:, None], (0, 1))
+        told = (unknown if told is None else told.to(scores)) + F.pad(nats[:, None], (0, 2))
         told = torch.cat([known, told])
         absent = told[:, 0]
         if odometry_known and len(told) and not bool(belief.any()):
             told[0, 1] = math.nan  # there is no query before the first
         likelihoods = scores if learned else self.likelihoods(scores, moments, None, absent)  # else in turn
         posteriors, due = [], len(scores) if last else max(0, len(scores) - self.lag)
-        by_odometry = self._by_odometry(motion, told[:, 1], camera) if odometry_known else None
+        by_odometry = self._by_odometry(motion, told[:, 1:], camera) if odometry_known else None
         for t in range(due):
             ahead = slice(t, t + 1 + self.lag)
             seen = likelihoods[ahead]
@@ -374,19 +377,19 @@ class PlaceFilter(SequenceModel):
         return answers, scores[:due], after
 
     @staticmethod
-    def _by_odometry(
-        motion: Motion, moved: Tensor, ahead: Tensor
-    ) -> tuple[Sequence[Motion | None], list[Tensor]]:
-        """The motion to each query of which the places moved are known, and by how much of a place the camera
-        is ahead before each and after all."""
-        places, aheads = odometry.whole(moved, float(ahead))
-        known = {one for one in places if one is not None}
-        if not known:
-            return [None] * len(places), aheads
+    def _by_odometry(motion: Motion, moved: Tensor, ahead: Tensor) -> tuple[Sequence[Motion | None], Tensor]:
+        """The motion to each query of which the places moved are known, by these and their spread, (B,2), and
+        by how much of a place the camera is ahead before each and after all."""
+        known = ~moved[:, 0].isnan()
+        places, aheads = odometry.whole(moved[:, 0], ahead)
+        if not bool(known.any()):
+            return [None] * len(known), aheads
         if not isinstance(motion, AlongRoute):
             raise InputError("places moved, and the map of an area; expected a route")
-        told = {one: odometry.Told(motion, one) for one in known}
-        return [None if one is None else told[one] for one in places], aheads
+        told = cache(partial(odometry.Told, motion))
+        slips = odometry.slips(*moved.unbind(1)).double().round(decimals=2)  # so that motions are few
+        each = zip(known.tolist(), places.tolist(), slips.tolist(), strict=True)
+        return [told(one, slip) if here else None for here, one, slip in each], aheads
 
     def _message(
         self, motion: Motion, motions: Sequence[Motion], likelihoods: Tensor, left_out: Sequence[int]
@@ -465,9 +468,10 @@ class PlaceFilter(SequenceModel):
         )
 
 
-def _or(told: Tensor | None, queries: int, default: float) -> Tensor:
-    """What is told of each of some queries, (B,), or a default."""
-    told = torch.full((queries,), default) if told is None else torch.as_tensor(told).detach().cpu()
+def _or(told: Tensor | float | None, queries: int, default: float) -> Tensor:
+    """What is told of each of some queries, (B,), or of all, or a default."""
+    told = torch.as_tensor(default if told is None else told).detach().cpu()
+    told = told.expand(queries) if told.ndim == 0 else told
     seen = f"what is told of {queries} queries is {tuple(told.shape)}"
     expect(told.shape == (queries,), "a number of each", seen)
     return told.to(torch.float64)

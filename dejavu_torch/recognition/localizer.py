@@ -10,6 +10,7 @@ from dataclasses import replace
 from typing import Any, NamedTuple
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from dejavu_torch.maps.place_map import PlaceMap
@@ -33,7 +34,7 @@ from dejavu_torch.recognition.taken import (
 )
 from dejavu_torch.recognition.views import Views
 from dejavu_torch.text import with_progress
-from dejavu_torch.types import Match, SequenceModel, State, Together, check_shape, expect
+from dejavu_torch.types import Match, Odometer, SequenceModel, State, Together, check_shape, expect
 
 AGES = 0.9  # by which a single image's probability falls with each repeat of its picture
 CACHED = 2**20  # scores processed at a time: they stay in the cache
@@ -53,7 +54,7 @@ class Matching(NamedTuple):
     search: Search = "auto"  # of single queries, see `DejaVu.localize`
     wrappers: tuple[Callable[[Scorer], Scorer], ...] = ()  # of the scores, from inside out
     ordered: bool = False  # single images, too: one that repeats is of a stream that has stalled
-    moved: Tensor | None = None  # places from each query to the next, (Q,), see `checked_moved`
+    moved: Odometer | None = None  # in places, unless for a drive, see `checked_moved`
 
     def as_it_drives(self) -> Matching:
         """The same for one drive whose queries come one after another."""
@@ -106,8 +107,8 @@ class Localizer:
         # probabilities, each by itself, of queries that a filter has yet to answer
         self.alone = torch.empty(0, dtype=torch.float64)
         self.last: Tensor | None = None  # the latest query
-        none = torch.empty(0, dtype=torch.float64)
-        self.moved = none if matching.moved is None else matching.moved  # to the next queries
+        moved, none = matching.moved, torch.empty(0, 2, dtype=torch.float64)
+        self.moved = none if moved is None or moved.metres else moved.moves  # to the next queries
         self.run = 0  # how many have repeated one picture up to it, see `repeats`
         self.stale = torch.empty(0, dtype=torch.int64)  # likewise, of queries that wait for their answers
         self.searcher = searcher
@@ -223,19 +224,18 @@ class Localizer:
         absent = torch.zeros(len(scores)) if absent is None else absent
         moved = self._moved(len(scores))
         with in_one_thread(scores.shape[1]):
-            told = zip(absent.split(size), moved.split(size), strict=True)
-            pairs = zip(scores.split(size), told, strict=True)
-            match = Match.joined(self._in_sequence(part, stored, False, *one) for part, one in pairs)
+            parts = zip(scores.split(size), absent.split(size), moved.split(size), strict=True)
+            match = Match.joined(self._in_sequence(part, stored, False, *told) for part, *told in parts)
         return match if odds is None else self._doubted(match, odds[len(odds) - len(match.index) :])
 
-    def told(self, moved: float) -> None:
-        """By how many places the camera moved to the next query."""
-        self.moved = torch.tensor([moved], dtype=torch.float64)
+    def told(self, moved: Tensor) -> None:
+        """By how many places the camera moved to the next query, (1,), or that and its deviation, (2,)."""
+        self.moved = F.pad(moved, (0, 2 - len(moved)), value=math.nan)[None]
 
     def _moved(self, count: int) -> Tensor:
-        """How far the camera moved to each of the next queries, NaN where nothing tells it."""
+        """How far the camera moved to each of the next queries, and the spread; NaN where nothing tells."""
         known, self.moved = self.moved[:count], self.moved[count:]
-        return torch.cat([known, torch.full((count - len(known),), math.nan, dtype=known.dtype)])
+        return F.pad(known, (0, 0, 0, count - len(known)), value=math.nan)
 
     def _told(self, match: Match, scorer: Scorer, queries: Tensor) -> Match:
         """The match of queries with what copies tell of them, if these answer now."""
@@ -302,7 +302,7 @@ class Localizer:
         moved: Tensor | None = None,
     ) -> Match:
         states = self.states or {T: m.start(scores.shape[1]) for T, m in self.models.items()}
-        known = {} if absent is None else {"absent": absent, "moved": moved}
+        known = {} if absent is None or moved is None else {"absent": absent, "moved": moved.unbind(1)}
         told: dict[str, dict[str, Any]] = {"filter": known}
         steps = {
             T: m.step(scores, states[T], self.route_starts, **told.get(m.answers, {}))

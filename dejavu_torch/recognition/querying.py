@@ -9,12 +9,12 @@ from functools import partial
 from pathlib import Path
 from typing import Literal
 
-from torch import Tensor
 from typing_extensions import Self
 
 from dejavu_torch.data.turning import facing_north
 from dejavu_torch.places.layout import Layout
 from dejavu_torch.recognition.filter import PlaceFilter
+from dejavu_torch.recognition.odometry import Moved
 from dejavu_torch.recognition.scorer import BestHeading, Earlier, Scorer
 from dejavu_torch.recognition.sequence import SequenceMatcher
 from dejavu_torch.recognition.smoother import PlaceSmoother
@@ -94,12 +94,25 @@ class Sequences:
 
 
 @dataclass(frozen=True)
-class Querying(Sequences):
+class Drives(Sequences):
+    """How consecutive queries are matched together.
+
+    Args:
+        moved: odometry: csv with a column moved, in places, or moved_m; or coordinates, the source's own
+        metres_per_place: of the map: a number, or its reference
+    """
+
+    moved: str | Path | Moved | None = None
+    metres_per_place: str | float | None = None
+
+
+@dataclass(frozen=True)
+class Querying(Drives):
     """How queries are matched.
 
     Args:
         ordered: queries are in order, as in a video; needed for a .npy of frames
-        unordered: queries are in no order: match each by itself
+        unordered: in no order: match each by itself
         centre: mean removes what all queries share but the map does not; default for 50 or more in order
         top: places per query, no two within the tolerance (localize: 5), each in a row with its rank; only
             the first has a probability
@@ -116,7 +129,6 @@ class Querying(Sequences):
     top: int | None = None
     loops: int | None = None
     headings: int = 1
-    moved: Path | Tensor | None = field(default=None, metadata=PYTHON)
     views: Views = field(default=ALONE, metadata=PYTHON)
 
     def order(self, matcher: SequenceModel | Literal["auto"] | None) -> bool | None:
@@ -163,4 +175,5 @@ class Querying(Sequences):
 
 
 SEQUENCES = Sequences()
+DRIVES = Drives()
 QUERYING = Querying()  # by the whole drive if queries are in order, else each by itself

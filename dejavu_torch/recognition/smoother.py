@@ -21,6 +21,7 @@ from dejavu_torch.recognition.engine import (
     Evidence,
     Fit,
     FittedPart,
+    Likelihood,
     Motion,
     Rates,
     explained,
@@ -44,7 +45,7 @@ from dejavu_torch.recognition.filter import near_scores
 from dejavu_torch.recognition.motion import AlongRoute, checked_rates, logits
 from dejavu_torch.recognition.speeds import FREE, Speeds, steady
 from dejavu_torch.recognition.taken import Singly, moves_along
-from dejavu_torch.types import Facts, InputError, SequenceModel, expect
+from dejavu_torch.types import Facts, InputError, Odometer, SequenceModel, expect
 
 WHOLE = "a smoother has to know the whole drive; expected a PlaceFilter, or a SequenceMatcher"
 
@@ -74,7 +75,7 @@ class PlaceSmoother(SequenceModel):
         motion: a kind of motion of one's own along a route, which is made of `States` and `Rates`; not for
             large maps, which are searched in parts.
         moved: (Q,), how many places the camera moved to each query of a drive from the one before it, as
-            odometry tells; the first does not count.
+            odometry tells, see `checked_moved`; the first does not count.
 
     Shape: scores (..., Q, N) -> (..., Q, N), -log of a probability in nats. Descriptors (Q,K), where given,
         tell how the queries depend on each other; else the scores tell it.
@@ -114,7 +115,7 @@ class PlaceSmoother(SequenceModel):
         links: Sequence[Link] = (),
         loop: bool = False,
         motion: type[Motion] = AlongRoute,
-        moved: Tensor | None = None,
+        moved: odometry.Moved | None = None,
     ) -> None:
         super().__init__()
         moves = checked_rates(moves, jump, leave, enter)
@@ -413,7 +414,7 @@ class Drive(NamedTuple):
     """What a smoother knows of the queries of a drive.
 
     means: (N,), mean score of each place. values: of the rank table. presence: how near queries come to the
-    map, if single images were asked. moved: (Q,), see `PlaceSmoother`.
+    map, if single images were asked. moved: see `PlaceSmoother`.
     """
 
     rows: Rows
@@ -423,7 +424,7 @@ class Drive(NamedTuple):
     separation: float
     tempering: float
     presence: Presence | None = None
-    moved: Tensor | None = None
+    moved: Odometer | None = None
 
     def log_likelihood(self, numbers: Tensor) -> Tensor:
         """Log likelihood of the places for some queries, 0 being off the map: (B,) -> (B,N)."""
@@ -442,8 +443,8 @@ def blocks_together(
     rates = (smoother.rates(mean) for (smoother, _), mean in zip(drives, means, strict=True))
     first = drives[0][0]
     together = Rates(*map(torch.stack, zip(*rates, strict=True)))
-    if any(drive.moved is not None for _, drive in drives):
-        yield from _by_odometry(drives, first.states(places, route_starts), together, size)
+    if queries and drives[0][1].moved is not None:
+        yield from _by_odometry(drives[0][1], first.states(places, route_starts), together, size)
         return
     motion = first.over_states(first.states(places, route_starts), together)
 
@@ -456,38 +457,38 @@ def blocks_together(
     yield from sweep(motion, likelihood, queries, still, size or size_of(motion, still))
 
 
-def _by_odometry(
-    drives: Sequence[tuple[PlaceSmoother, Drive]], states: States, rates: Rates, size: int | None
-) -> Iterator[Block]:
+def _by_odometry(drive: Drive, states: States, rates: Rates, size: int | None) -> Iterator[Block]:
     """As `blocks_together`, of one drive whose moves are known but for their scale."""
-    ((_, drive),), motion = drives, odometry.moving(states, rates)
-    assert drive.moved is not None
+    moved, queries = drive.moved, torch.arange(len(drive.spacing.stopped))
+    assert moved is not None
+    every = torch.cat([drive.log_likelihood(part) for part in queries.split(math.isqrt(len(queries)))])
 
-    def likelihood(steps: odometry.Steps, first: int, last: int) -> Tensor:
-        numbers = steps.queries[first:last]
-        known, log = numbers >= 0, drive.means.new_zeros(last - first, len(drive.means))
-        if known.any():
-            log[known] = drive.log_likelihood(numbers[known])
-        return motion.wide(log.exp()[None], 1.0)
+    def along(moved: Odometer) -> tuple[Motion, Likelihood, Tensor, Tensor]:
+        asked, still = odometry.steps_of(moved)
+        motion = odometry.moving(states, rates, 1, float(odometry.slips(*moved.between(0, -1))))
+
+        def likelihood(first: int, last: int) -> Tensor:
+            numbers = asked[first:last, None].to(every.device)
+            log = torch.where(numbers < 0, 0, every[numbers[:, 0].clamp(min=0)])  # 0 on the way
+            return motion.wide(log.exp()[None], 1.0)
+
+        return motion, likelihood, still[None].to(every.device), asked
 
     @torch.no_grad()
-    def log_of(steps: odometry.Steps) -> float:
-        still = steps.still[None].to(drive.means.device)
+    def log_of(moved: Odometer) -> float:
+        motion, likelihood, still, _ = along(moved)
         numbers = range(0, still.shape[1], size_of(motion, still))
-        return sum(
-            float(part.log.sum()) for part in forward(motion, partial(likelihood, steps), numbers, still)
-        )
+        return sum(float(part.log.sum()) for part in forward(motion, likelihood, numbers, still))
 
-    steps = max((odometry.steps_of(scale * drive.moved) for scale in chosen.SCALES), key=log_of)
-    still = steps.still[None].to(drive.means.device)
-    size = size or size_of(motion, still)
-    for block in sweep(motion, partial(likelihood, steps), still.shape[1], still, size):
-        numbers = steps.queries[block.first : block.first + block.log.shape[-1]]
+    for scales in odometry.paces(moved), chosen.SCALES:
+        moved = max(map(moved.times, scales), key=log_of)
+    motion, likelihood, still, asked = along(moved)
+    for block in sweep(motion, likelihood, still.shape[1], still, size or size_of(motion, still)):
+        numbers = asked[block.first : block.first + block.log.shape[-1]]
         known = numbers >= 0
         if known.any():
-            _, before, like, after, log, _ = block
-            before, like, after = before[:, known], like[:, known], after[:, known]
-            yield Block(int(numbers[known][0]), before, like, after, log[:, known], motion)
+            before, like, after, log = (one[:, known] for one in block[1:5])
+            yield Block(int(numbers[known][0]), before, like, after, log, motion)
 
 
 def speeds_of(samples: Sequence[FittedPart], fit: Fit) -> Speeds:

@@ -12,10 +12,12 @@ from PIL import Image
 
 from dejavu_torch import compare, open_source
 from dejavu_torch.data.arrays import ArrayTraverse
-from dejavu_torch.data.coordinates import coordinates_of, read_coordinates
+from dejavu_torch.data.coordinates import coordinates_of, odometer_of, read_coordinates, read_odometer
 from dejavu_torch.data.ground_truth import find_ground_truth
 from dejavu_torch.data.source import check_not_read
+from dejavu_torch.data.tables import read_table
 from dejavu_torch.data.traverse import Chain, Part
+from dejavu_torch.types import Coordinates
 
 NAN = math.nan
 
@@ -224,8 +226,8 @@ def test_heights_are_compared_only_if_both_visits_have_them(tmp_path, caplog):
     two = ArrayTraverse(torch.rand(3, 4), "gps")
     (tmp_path / "p.txt").write_text("\n".join(f"1 0 0 {i} 0 1 0 -7 0 0 1 {10 * i} " for i in range(3)))
     (tmp_path / "g.csv").write_text("x,y\n" + "\n".join(f"{i},{10 * i}" for i in range(3)))
-    three.coordinates, _ = read_coordinates(tmp_path / "p.txt", three)
-    two.coordinates, _ = read_coordinates(tmp_path / "g.csv", two)
+    three.coordinates, *_ = read_coordinates(tmp_path / "p.txt", three)
+    two.coordinates, *_ = read_coordinates(tmp_path / "g.csv", two)
     one, other = coordinates_of([three, two], "metres")
     assert one.tolist() == other.tolist() == [[0, 0], [1, 10], [2, 20]]
     assert "gps has coordinates of two numbers" in caplog.text
@@ -269,6 +271,92 @@ def test_a_report_tells_errors_in_metres(tmp_path):
     reference, query = ArrayTraverse(rows, "one"), ArrayTraverse(rows.clone(), "two")
     for traverse, y in ((reference, 0), (query, 1)):
         (tmp_path / "w.csv").write_text("x,y\n" + "\n".join(f"{10 * i},{y}" for i in range(60)))
-        traverse.coordinates, _ = read_coordinates(tmp_path / "w.csv", traverse)
+        traverse.coordinates, *_ = read_coordinates(tmp_path / "w.csv", traverse)
     facts = compare(reference, query, "metres:2", tolerance=0).report.facts
     assert facts["error_metres"]["all"] == {"0.5": 1.0, "0.9": 1.0, "0.99": 1.0}
+
+
+def odometer(text, traverse, tmp_path):
+    (tmp_path / "moved.csv").write_text(text)
+    return read_odometer(read_table(tmp_path / "moved.csv", "moves"), traverse)
+
+
+@pytest.mark.parametrize(
+    ("text", "moves", "metres"),
+    [
+        ("moved\nfirst\n1.5\n0\n", [[0, NAN], [1.5, NAN], [0, NAN]], False),
+        ("moved [m]\n0\n1.5\n0\n", [[0, NAN], [1.5, NAN], [0, NAN]], True),
+        ("frame,moved\n0,7\n1,1\n2,2\n", [[0, NAN], [1, NAN], [2, NAN]], False),
+        ("moved_m,moved_spread\n9,9\n1,.5\n2,0\n", [[0, 0], [1, 0.5], [2, 0]], True),
+        ("moved_spread [cm],moved [cm]\n1,1\n50,100\n30,200\n", [[0, 0], [1, 0.5], [2, 0.3]], True),
+    ],
+)
+def test_what_an_odometer_tells_of_each_frame(text, moves, metres, tmp_path):
+    read = odometer(text, ArrayTraverse(torch.rand(3, 4), "three"), tmp_path)
+    np.testing.assert_allclose(read.moves, moves)
+    assert read.metres == metres
+
+
+def test_an_odometer_with_a_clock_or_names_of_its_own(tmp_path):
+    """Its rows add up, between two of them evenly: the images are at 1, 1.5 and 2.75 s."""
+    folder = images(tmp_path / "a", "1.0.png", "1.5.png", "2.75.png")
+    text = "time,moved,moved_spread\n.5,8,8\n1.0,1,1\n1.5,2,3\n2,4,4\n2.5,8,0\n3,2,0\n"
+    read = odometer(text, open_source(folder), tmp_path)
+    np.testing.assert_allclose(read.moves, [[0, 0], [2, 3], [13, 4]])
+    named = odometer(
+        "name,moved\n1.0.png,1\nlost.png,2\n1.5.png,3\n2.75.png,4\n", open_source(folder), tmp_path
+    )
+    assert named.moves[:, 0].tolist() == [0, 5, 4]
+
+
+def test_a_column_of_coordinates_is_cut_with_the_frames(tmp_path, caplog):
+    np.save(tmp_path / "six.npy", np.random.default_rng(0).random((6, 4), np.float32))
+    rows = [f"{i},0,{i},{i}" for i in range(6)]
+    (tmp_path / "where.csv").write_text("\n".join(["x,y,moved_m,moved_spread", *rows]))
+    source = f"{tmp_path / 'six.npy'}?coordinates={tmp_path / 'where.csv'}"
+    assert open_source(source).odometer.moves[:, 0].tolist() == [0, 1, 2, 3, 4, 5]
+    some = open_source(f"{source}&start=1&step=2").odometer
+    np.testing.assert_allclose(some.moves, [[0, 0], [5, 13**0.5], [9, 41**0.5]])
+    assert some.metres
+    assert "not used" not in caplog.text
+    (tmp_path / "where.csv").write_text("x,y,moved\n" + "0,0,1\n" * 5 + "0,0,yes\n")
+    assert open_source(source).odometer is None
+    assert "the column moved is not used" in caplog.text
+    assert "line 7: moved is 'yes'" in caplog.text
+
+
+def test_coordinates_tell_what_an_odometer_would_read():
+    traverse = ArrayTraverse(torch.rand(7, 4), "seven")
+    places = [[NAN, NAN], [0, 0], [3, 4], [NAN, NAN], [3, 10], [3, 10], [NAN, NAN]]
+    traverse.coordinates = Coordinates(torch.tensor(places).double())
+    read = odometer_of(traverse)
+    np.testing.assert_allclose(read.values[:, 0], [NAN, 0, 5, 8, 11, 11, NAN])
+    assert read.metres
+    degrees = torch.tensor([[48.0, 11.0], [48.001, 11.0]]).double()
+    two = ArrayTraverse(torch.rand(2, 4), "two")
+    two.coordinates = Coordinates(degrees, degrees=True)
+    assert float(odometer_of(two).moves[1, 0]) == pytest.approx(111.2, abs=0.1)
+    for other in (None, Coordinates(degrees, frame="pixels")):
+        two.coordinates = other
+        with refused("two without coordinates", "metres or degrees"):
+            odometer_of(two)
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("", ["columns", "a column moved"]),
+        ("x,y\n1,2\n", ["columns x, y", "a column moved"]),
+        ("moved [px]\n1\n", ["columns moved[px]", "a column moved"]),
+        ("moved\n", ["0 rows", "a column moved"]),
+        ("moved\n1\nfar\n", ["line 3", "'far'", "a number"]),
+        ("moved\n1\n-2\n", ["line 3", "'-2'", "at least 0"]),
+        ("frame,moved\n1,\n2\n", ["line 3", "''", "a number"]),
+        ("moved,moved_spread\n1,1\n2,\n", ["line 3", "moved_spread is ''", "a number"]),
+        ("moved,moved_spread_m\n1,1\n2,1\n", ["moved and moved_spread_m", "one unit"]),
+        ("moved\n1\n2\n3\n", ["3 rows, two 2 frames", "as many"]),
+    ],
+)
+def test_what_is_no_odometer_is_refused(text, told, tmp_path):
+    with refused(*told):
+        odometer(text, ArrayTraverse(torch.rand(2, 4), "two"), tmp_path)

@@ -1342,8 +1342,22 @@ MUTANTS = [
     Mutant(
         "A whole drive finds the scale of its odometry.",
         "dejavu_torch/recognition/smoother.py",
-        "for scale in chosen.SCALES), key=log_of)",
-        "for scale in (1.0,)), key=log_of)",
+        "for scales in odometry.paces(moved), chosen.SCALES:",
+        "for scales in (odometry.paces(moved),):",
         ("tests/recognition/test_moved.py::-k scale",),
+    ),
+    Mutant(
+        "A spread counts in the unit of the odometer.",
+        "dejavu_torch/types.py",
+        "[scale, scale**2]",
+        "[scale, scale]",
+        ("tests/recognition/test_moved.py::-k unit",),
+    ),
+    Mutant(
+        "What an odometer reads between two frames adds up, whichever frames there are.",
+        "dejavu_torch/data/coordinates.py",
+        "(1, 2)[: len(roles)]).cumsum(0)",
+        "(1, 2)[: len(roles)])",
+        ("tests/data/test_coordinates.py::-k odometer",),
     ),
 ]

@@ -15,25 +15,37 @@ from hypothesis import strategies as st
 from reference import Steps, forward_backward
 from test_smoother import noise, shown
 
-from dejavu_torch import DejaVu, LiveLocalizer, PlaceFilter, PlaceSmoother, SequenceMatcher
+from dejavu_torch import (
+    DejaVu,
+    LiveLocalizer,
+    PlaceFilter,
+    PlaceSmoother,
+    Querying,
+    SequenceMatcher,
+    compare,
+)
+from dejavu_torch.data.arrays import ArrayTraverse
+from dejavu_torch.evaluation.matches import write_matches
 from dejavu_torch.places.layout import Layout
 from dejavu_torch.places.states import States
-from dejavu_torch.recognition import chosen, engine, odometry
-from dejavu_torch.recognition.drive import DriveQuery, localize_drives
+from dejavu_torch.recognition import chosen, engine, large, odometry
+from dejavu_torch.recognition.drive import DriveQuery, localize_drives, speed_of
 from dejavu_torch.recognition.engine import Rates
 from dejavu_torch.recognition.motion import AlongRoute
 from dejavu_torch.recognition.scorer import OfRows
 from dejavu_torch.recognition.smoother import rows_of
 from dejavu_torch.recognition.speeds import FREE, steady
+from dejavu_torch.types import Odometer
 
 SLIP = chosen.ODOMETRY / 2
 ONE = (SLIP, 1 - 2 * SLIP, SLIP)
 
 
 def test_a_drive_in_steps_of_one_place():
-    steps = odometry.steps_of(torch.tensor([0.0, 1, 0, 3, 0.4, 0.4, 0.4]))
-    assert steps.queries.tolist() == [0, 1, 2, -1, -1, 3, 4, 5, 6]
-    assert steps.still.tolist() == [True, False, True, False, False, False, True, False, True]
+    moved = torch.tensor([0.0, 1, 0, 3, 0.4, 0.4, 0.4])
+    queries, still = odometry.steps_of(odometry.checked_moved(moved, 7))
+    assert queries.tolist() == [0, 1, 2, -1, -1, 3, 4, 5, 6]
+    assert still.tolist() == [True, False, True, False, False, False, True, False, True]
 
 
 @given(st.lists(st.floats(0, 3), min_size=1, max_size=8), st.integers(0, 99))
@@ -43,15 +55,14 @@ def test_a_smoother_takes_steps_of_one_place(moved, seed):
     moved[0] = 0
     scores = noise(len(moved), 5, seed=seed).double()
     smoother = PlaceSmoother(moved=moved).double()
-    steps, drive = odometry.steps_of(moved), smoother.drive(scores)
+    drive = smoother.drive(scores)
+    queries, still = odometry.steps_of(drive.moved)
     log = drive.log_likelihood(torch.arange(len(moved)))
-    rows = [log[i].tolist() if i >= 0 else [0.0] * 5 for i in steps.queries.tolist()]
+    rows = [log[i].tolist() if i >= 0 else [0.0] * 5 for i in queries.tolist()]
     jump, leave, enter = 0.001, 0.001, 0.01
     with torch.no_grad():
-        known, _ = forward_backward(
-            Steps(5, ONE, jump, leave, enter, smoother.turn), rows, steps.still.tolist()
-        )
-    states = torch.tensor(known)[steps.queries >= 0]
+        known, _ = forward_backward(Steps(5, ONE, jump, leave, enter, smoother.turn), rows, still.tolist())
+    states = torch.tensor(known)[queries >= 0]
     there, back = states[:, :-1].chunk(2, 1)
     expected = torch.cat([there + back.flip(1), states[:, -1:]], 1).double()
     with pytest.MonkeyPatch.context() as patch:
@@ -185,21 +196,164 @@ def test_a_csv_of_moves(model, route, tmp_path):
     assert found == model.localize(queries, sequence=PlaceFilter(), moved=moved).index.tolist()
 
 
-@pytest.mark.parametrize(
-    ("text", "told"),
-    [
-        ("", ["columns", "a column moved"]),
-        ("x,y\n1,2\n", ["columns x, y", "a column moved"]),
-        ("moved\n", ["0 rows", "a column moved"]),
-        ("moved\n1\nfar\n", ["line 3", "'far'", "a number"]),
-        ("frame,moved\n1,\n2\n", ["line 3", "''", "a number"]),
-    ],
-)
-def test_a_csv_without_moves_is_refused(text, told, tmp_path):
-    path = tmp_path / "moved.csv"
-    path.write_text(text)
-    with refused(*told):
-        odometry.read_moved(path)
+def metres(moved, spread=math.nan, each=0.5):
+    """An odometer in metres that tells of these moves in places."""
+    variance = torch.full_like(moved, spread * each).square()
+    return Odometer(torch.stack([each * moved, variance], 1).cumsum(0), metres=True)
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("noisy", [0.0, 0.2])
+@pytest.mark.parametrize("pace", [0.4, 1.0, 2.7, 5.0])
+def test_a_whole_drive_finds_metres_a_place(pace, noisy):
+    path = (pace * torch.arange(min(150, int(380 / pace)))).long()
+    draw = torch.randn(len(path), generator=torch.Generator().manual_seed(2))
+    moved = (path.double().diff(prepend=path[:1].double()) * (1 + noisy * draw)).clamp(min=0)
+    scores = shown(400, path.tolist(), clear=3.0)
+    smoother = PlaceSmoother(separation=3.0, moved=metres(moved, each=7.3))
+    posterior = smoother.posterior(scores, noise(len(path), 16))
+    assert float(((posterior[:, :-1].argmax(1) - path).abs() <= 3).double().mean()) > 0.95
+
+
+def test_a_camera_that_stands_has_any_scale():
+    smoother = PlaceSmoother(moved=metres(torch.zeros(30).double()))
+    posterior = smoother.posterior(shown(50, [20] * 30, clear=3.0), noise(30, 16))
+    assert posterior.sum(1).tolist() == pytest.approx([1] * 30)
+    assert len(smoother.posterior(noise(0, 50))) == 0
+
+
+def test_a_spread_widens_a_step_in_the_unit_of_its_odometer():
+    """The share s of a place that is missed or passed twice gives n places the variance n s."""
+    way, spread = torch.tensor([4.0, 4, 1, 0, 0, 2]), torch.tensor([1.0, 2, 0.3, 1, 0, math.nan])
+    assert odometry.slips(way, spread).tolist() == pytest.approx([0.25, 1, 0.09, 1, 0, chosen.ODOMETRY])
+    states, rates = States(60, 1), Rates(*(torch.tensor(one).double() for one in ([1.0], 0, 0, 0)))
+    moved = odometry.moving(states, rates, 4, 0.25).moved(torch.eye(61)[10].double())[:-1]
+    at = torch.arange(60).double()
+    mean = (moved * at).sum()
+    assert float(mean) == pytest.approx(14)
+    assert float((moved * (at - mean) ** 2).sum()) == pytest.approx(1)
+    odometer = metres(torch.full((9,), 2.0).double(), 0.6).times(2.0)
+    assert not odometer.metres
+    assert torch.allclose(odometer.moves[1:], torch.tensor([2.0, 0.6]).double())
+    whole_drive = odometer.between(0, -1)
+    assert float(odometry.slips(*whole_drive)) == pytest.approx(0.18)
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("kind", ["filter", "drive"])
+def test_odometry_that_is_said_to_be_poor_is_believed_less(kind):
+    """Moves of three places and four more or less, of a camera that moves by three."""
+    path = torch.arange(0, 300, 3)
+    off = torch.randint(-1, 2, (100,), generator=torch.Generator().manual_seed(1))
+    moved, scores = (3 + 2 * off).double(), shown(320, path.tolist(), clear=1.5)
+
+    def sure(spread):
+        told = moved, torch.full((100,), spread).double()
+        if kind == "drive":
+            posterior = PlaceSmoother(separation=2.0, moved=told).posterior(scores, noise(100, 16))
+            return float(posterior.gather(1, path[:, None]).log().mean())
+        model = PlaceFilter(within=0)
+        found, _ = model.step(scores, model.start(320), moved=told)
+        return float(-found.gather(1, path[:, None]).mean())
+
+    assert sure(1.7) > sure(0.1) + 0.1
+
+
+def test_a_source_tells_how_far_it_moved(model, route, tmp_path, caplog):
+    """By a column of its coordinates' file, or by these, where the reference tells metres a place."""
+    at, moved = irregular(150, 300)
+    queries = route[at] + 1.2 * torch.randn(len(at), 32, generator=torch.Generator().manual_seed(1))
+    expected = model.localize(queries, sequence=PlaceFilter(), moved=moved)
+    np.save(tmp_path / "query.npy", queries.numpy())
+    np.save(tmp_path / "map.npy", route.numpy())
+    named = [f"{2 * float(place)},0,{one}" for place, one in zip(at, moved, strict=True)]
+    (tmp_path / "query.csv").write_text("\n".join(["x,y,moved", *named]))
+    (tmp_path / "map.csv").write_text("\n".join(["x,y", *(f"0,{2 * i}" for i in range(300))]))
+    source, reference = (f"{tmp_path / one}.npy?coordinates={tmp_path / one}.csv" for one in ("query", "map"))
+    found = model.localize(source, sequence=PlaceFilter())
+    assert torch.equal(found.index, expected.index)
+    for each in (2, "2.0", reference):
+        querying = Querying(PlaceFilter(), moved="coordinates", metres_per_place=each)
+        (match,) = model.matches(source, querying)
+        assert torch.equal(match.index, expected.index)
+    drive = model.localize(source, sequence=PlaceSmoother(), moved="coordinates")
+    assert float(((drive.index - at).abs() <= 2).double().mean()) > 0.95
+    assert not caplog.records
+    model.localize(source, sequence=None)
+    assert "moved is not used: places moved, and single images" in caplog.text
+    with refused("metres moved, and a filter", "--metres_per_place"):
+        model.localize(source, sequence=PlaceFilter(), moved="coordinates")
+    for each, told in (
+        (0, "0 metres a place"),
+        (-1, "a number above 0"),
+        (tmp_path / "map.npy", "coordinates"),
+    ):
+        with refused(told):
+            [*model.matches(source, Querying(PlaceFilter(), moved="coordinates", metres_per_place=str(each)))]
+    with refused("and moves in places", "metres"):
+        [*model.matches(source, Querying(PlaceFilter(), metres_per_place=2.0))]
+
+
+def test_a_large_map_refuses_in_a_line_what_a_source_has_not_asked_for(model, route, monkeypatch, caplog):
+    monkeypatch.setattr(large, "LARGE_MAP", 200)
+    at, moved = irregular(150, 300)
+    queries = ArrayTraverse(route[at])
+    with refused(
+        f"places moved, and {len(at)} queries on 300 places", "a route of fewer places, or", "a filter"
+    ):
+        model.localize(queries, sequence=PlaceSmoother(), moved=moved)
+    queries.odometer = odometry.checked_moved(moved, len(at))
+    assert model.localize(queries, sequence=PlaceSmoother()).is_drive
+    assert "its column moved is not used: places moved" in caplog.text
+
+
+def test_the_speed_of_a_drive(model, route, tmp_path):
+    """By its answers: two places a query, back at one, a stop, and a jump."""
+    path = [*range(0, 120, 2), *range(118, 60, -1), *[60] * 30, *range(200, 290, 2)]
+    right = torch.tensor(path)
+    queries = route[right] + 0.3 * torch.randn(len(path), 32, generator=torch.Generator().manual_seed(1))
+    match = model.localize(queries, sequence=PlaceSmoother(), centre=False)
+    assert match.is_drive
+    speed = match.speed.tolist()
+    for some, expected in (
+        (slice(5, 55), 2),
+        (slice(65, 110), -1),
+        (slice(125, 142), 0),
+        (slice(155, 185), 2),
+    ):
+        assert speed[some] == pytest.approx([expected] * len(speed[some]), abs=0.2)
+    assert float(match[150:160].speed.abs().max()) <= 2.2
+    assert model.localize(queries, sequence=PlaceFilter()).speed is None
+    found = speed_of(torch.tensor([0, 3, 6, 9]), torch.tensor([0.9, 0.9, 0.2, 0.9]))
+    assert found.tolist() == [3, 3, 3, 3]
+    assert bool(speed_of(torch.tensor([0, 3]), torch.tensor([0.9, 0.2])).isnan().all())
+    elsewhere = torch.randn(60, 32, generator=torch.Generator().manual_seed(7))
+    assert model.localize(elsewhere, sequence=PlaceSmoother()).speed is None
+    write_matches(tmp_path / "m.csv", [match])
+    with (tmp_path / "m.csv").open() as file:
+        written = [float(row["speed"]) for row in csv.DictReader(file)]
+    assert written == pytest.approx(speed, abs=0.01)
+
+
+def test_a_comparison_by_odometry(route, tmp_path):
+    at, moved = irregular(150, 300)
+    queries = route[at] + 1.5 * torch.randn(len(at), 32, generator=torch.Generator().manual_seed(1))
+    truth = {query: [int(place)] for query, place in enumerate(at)}
+    (tmp_path / "t.csv").write_text("query,place\n" + "\n".join(f"{q},{p[0]}" for q, p in truth.items()))
+
+    def scores(**told):
+        model = DejaVu(whitening="none")
+        querying = Querying("drive", centre="none", **told)
+        found = compare(route, queries, str(tmp_path / "t.csv"), model, querying=querying).report
+        return found.ours.sequences, found.facts["drive"]
+
+    (plain, _), (told, drive) = scores(), scores(moved=moved)
+    assert told["filter"].auc > plain["filter"].auc + 0.05
+    assert told["smoother"].auc > 0.95
+    assert drive["speed"] == pytest.approx(float(moved.mean()), abs=0.4)
+    in_metres, _ = scores(moved=metres(moved))  # which only the drive can use
+    assert in_metres["smoother"].auc == pytest.approx(told["smoother"].auc, abs=0.02)
+    assert in_metres["filter"] == plain["filter"]
 
 
 class Own(AlongRoute):
