@@ -42,7 +42,7 @@ def spectral(places: Tensor, budget: float, seed: int | None = None) -> Kept:
     route = SpectralMapper(budget)(places[order])
     back = torch.empty_like(places)
     back[order] = route.decode(0)
-    return Kept(back, sum(tensor.nbytes for tensor in route.packed().values()))
+    return Kept(back, sum(tensor.nbytes for name, tensor in route.packed().items() if name != "digest"))
 
 
 def every_kth(

@@ -107,7 +107,8 @@ def _coded(
         return
     wrapped = None if order is None else partial(Reordered, order=order)
     found = model.localize_descriptors(run.query_features, run.matching, wrapped)
-    yield found, sum(tensor.nbytes for tensor in model.map.packed().values())
+    packed = model.map.packed()  # of which no answer needs the digest
+    yield found, sum(tensor.nbytes for name, tensor in packed.items() if name != "digest")
 
 
 def _keyframes(run: Localization, place_map: SpectralMap, budget: float) -> Iterator[tuple[Match, int]]:

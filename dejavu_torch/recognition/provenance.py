@@ -31,6 +31,8 @@ CORRELATED, STEADY = 0.25, 0.3  # means of other networks at most, and of parts 
 LARGER = 4.0  # ratio of the sizes of one network's, at most
 WIDE, FEWEST_SPREAD = 16, 50  # dimensions, and descriptors, of fewer of which nothing is told
 
+ALONG = {1: True, 2: False}  # whether frames are taken one after the other, by the dimensions of a layout
+
 Relation = Literal["", "frames", "between"]
 SEEN: dict[Relation, str] = {
     "frames": "frames of the map itself",
@@ -133,6 +135,8 @@ class Provenance:
     def doubts(self, place_map: PlaceMap, digests: Tensor, queries: Traverse) -> list[Doubt]:
         """Why answers to queries may mislead, of which there are digests (Q,9)."""
         lines, found = [self.unlike(queries)], alike(place_map.digest, digests).relation
+        images = len(queries.frame_shape) == 3  # a second visit of little noise lies between, too
+        found = found if found != "between" or (images and ALONG[place_map.layout.dimensions]) else ""
         known = [(name, torch.tensor([*own], dtype=torch.uint8).view(-1, BYTES)) for name, own in self.taught]
         names = [name for name, own in known if not found and alike(own, digests).relation]
         lines += [f"the queries are {SEEN[found]}: {SO}"] if found else []
