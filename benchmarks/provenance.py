@@ -21,7 +21,7 @@ from dejavu_torch.features.hog import HOG
 from dejavu_torch.features.pixels import PatchPixels
 from dejavu_torch.maps.digest import digests_of
 from dejavu_torch.model import DejaVu
-from dejavu_torch.recognition.provenance import Spread, alike
+from dejavu_torch.recognition.provenance import Spread, alike, relation
 from dejavu_torch.types import Traverse
 
 VISIT, FAST, PART = "second visit", "every third frame of it", "a third of it"
@@ -94,9 +94,10 @@ def described(model: DejaVu, traverse: Traverse) -> Tensor:
 
 
 def related(model: DejaVu, queries: Tensor) -> Row:
-    found = alike(model.map.digest, digests_of(queries, follow=False))
-    same = found.same / max(1, found.places)
-    return {"places": found.places, "same": same, "beyond": found.beyond, "told": found.relation}
+    asked = digests_of(queries, follow=False)
+    places, same, beyond = alike(model.map.digest, asked)
+    told = relation(model.map, model.map.digest, asked)
+    return {"places": places, "same": same / max(1, places), "beyond": beyond, "told": told}
 
 
 def spread(reference: Traverse, query: Traverse) -> Row:

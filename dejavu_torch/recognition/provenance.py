@@ -25,10 +25,11 @@ ROWS = 256  # of ready descriptors whose mean is taken, at most
 # Chosen on every other route of `benchmarks provenance`, which tells of the others.
 SAME, FEWEST_SAME = 0.15, 8  # share of the places, and places, at least, that a query equals
 CHANGED = 3  # signs that change to the next frame, at least, so that equal ones tell something
-BETWEEN, FEWEST_BETWEEN = 0.31, 32  # signs beyond both queries, as a share of those that change; places
+BETWEEN = 0.31  # signs beyond both queries, as a share of those that change, at most
+FEWEST_BETWEEN = {1: 32, 2: math.inf}  # places, by the dimensions of a layout: over areas nothing is told
 CORRELATED, STEADY = 0.25, 0.3  # means of other networks at most, and of parts of one drive at least
 LARGER = 4.0  # ratio of the sizes of one network's, at most
-WIDE, FEWEST_SPREAD = 16, 50  # dimensions, and descriptors, of fewer of which nothing is told
+WIDE, FEWEST_SPREAD = 16, 50  # dimensions, and ready descriptors, of fewer of which little can be told
 
 Relation = Literal["", "frames", "between"]
 SEEN: dict[Relation, str] = {
@@ -131,9 +132,9 @@ class Provenance:
 
     def doubts(self, place_map: PlaceMap, digests: Tensor, queries: Traverse) -> list[Doubt]:
         """Why answers to queries may mislead, of which there are digests (Q,9)."""
-        lines, found = [self.unlike(queries)], alike(place_map.digest, digests).relation
+        lines, found = [self.unlike(queries)], relation(place_map, place_map.digest, digests)
         known = [(name, torch.tensor([*own], dtype=torch.uint8).view(-1, BYTES)) for name, own in self.taught]
-        names = [name for name, own in known if not found and alike(own, digests).relation]
+        names = [name for name, own in known if not found and relation(place_map, own, digests)]
         lines += [f"the queries are {SEEN[found]}: {SO}"] if found else []
         lines += [f"the queries taught this map ({', '.join(names)}): {SO}"] if names else []
         return [Doubt("provenance", line) for line in lines if line]
@@ -151,12 +152,14 @@ class Alike(NamedTuple):
     same: int = 0
     beyond: float = math.inf
 
-    @property
-    def relation(self) -> Relation:
-        """Whether the queries are frames of the map, or lie between them."""
-        if self.same >= max(FEWEST_SAME, SAME * self.places):
-            return "frames"
-        return "between" if self.places >= FEWEST_BETWEEN and self.beyond <= BETWEEN else ""
+
+def relation(place_map: PlaceMap, known: Tensor, asked: Tensor) -> Relation:
+    """Whether queries are frames of a map, or of a drive that taught it, or lie between them; see `alike`."""
+    places, same, beyond = alike(known, asked)
+    if same >= max(FEWEST_SAME, SAME * places):
+        return "frames"
+    tells = places >= FEWEST_BETWEEN[place_map.layout.dimensions] and place_map.dimension >= WIDE
+    return "between" if tells and beyond <= BETWEEN else ""
 
 
 def alike(known: Tensor, asked: Tensor) -> Alike:
@@ -187,7 +190,7 @@ def alike(known: Tensor, asked: Tensor) -> Alike:
 def check_independent(place_map: PlaceMap, visit: Traverse, descriptors: Tensor) -> None:
     """Refuse to calibrate a map by its own drive; of ready descriptors between its frames only warn, since
     those of another visit with little noise look alike."""
-    found = alike(place_map.digest, digests_of(descriptors, follow=False)).relation
+    found = relation(place_map, place_map.digest, digests_of(descriptors, follow=False))
     line = f"calibrating by {visit.name}: it has {SEEN[found]}" if found else ""
     if found == "frames" or (found and len(visit.frame_shape) == 3):
         raise InputError(f"{line}; expected another visit")
