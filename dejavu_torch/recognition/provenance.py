@@ -25,7 +25,7 @@ ROWS = 256  # of ready descriptors whose mean is taken, at most
 # Chosen on every other route of `benchmarks provenance`, which tells of the others.
 SAME, FEWEST_SAME = 0.15, 8  # share of the places, and places, at least, that a query equals
 CHANGED = 3  # signs that change to the next frame, at least, so that equal ones tell something
-BETWEEN = 0.31  # signs beyond both queries, as a share of those that change, at most
+BETWEEN, BEYOND = 0.31, 0.41  # signs beyond both queries: of those that change, and of those that differ
 FEWEST_BETWEEN = {1: 32, 2: math.inf}  # places, by the dimensions of a layout: over areas nothing is told
 CORRELATED, STEADY = 0.25, 0.3  # means of other networks at most, and of parts of one drive at least
 LARGER = 4.0  # ratio of the sizes of one network's, at most
@@ -145,21 +145,22 @@ class Alike(NamedTuple):
 
     places: that are compared. same: of them that equal a query. beyond: signs in which places differ from
     both of two queries that follow each other, in proportion to those that change from a query, or a place,
-    to the next.
+    to the next; both: in proportion to those in which they differ from the nearest query.
     """
 
     places: int = 0
     same: int = 0
     beyond: float = math.inf
+    both: float = math.inf
 
 
 def relation(place_map: PlaceMap, known: Tensor, asked: Tensor) -> Relation:
     """Whether queries are frames of a map, or of a drive that taught it, or lie between them; see `alike`."""
-    places, same, beyond = alike(known, asked)
+    places, same, beyond, both = alike(known, asked)
     if same >= max(FEWEST_SAME, SAME * places):
         return "frames"
     tells = places >= FEWEST_BETWEEN[place_map.layout.dimensions] and place_map.dimension >= WIDE
-    return "between" if tells and beyond <= BETWEEN else ""
+    return "between" if tells and beyond <= BETWEEN and both <= BEYOND else ""
 
 
 def alike(known: Tensor, asked: Tensor) -> Alike:
@@ -182,9 +183,10 @@ def alike(known: Tensor, asked: Tensor) -> Alike:
     changed = torch.minimum(others, known[pairs, -1].float())
     differs = queries[at] != places
     beside = [queries[(at + step).clamp(0, len(queries) - 1)] != places for step in (-1, 1)]
-    beyond = torch.stack([(differs & one).sum(1) for one in beside]).amin(0)
+    beyond = float(torch.stack([(differs & one).sum(1) for one in beside]).amin(0).sum())
     same = int(((nearest == 0) & (changed >= CHANGED)).sum())
-    return Alike(len(places), same, float(beyond.sum()) / max(float(changed.sum()), 1e-9))
+    shares = (beyond / max(float(signs.sum()), 1e-9) for signs in (changed, nearest))
+    return Alike(len(places), same, *shares)
 
 
 def check_independent(place_map: PlaceMap, visit: Traverse, descriptors: Tensor) -> None:
