@@ -21,16 +21,21 @@ from dejavu_torch.features.hog import HOG
 from dejavu_torch.features.pixels import PatchPixels
 from dejavu_torch.maps.digest import digests_of
 from dejavu_torch.model import DejaVu
-from dejavu_torch.recognition.provenance import Spread, alike
+from dejavu_torch.recognition.provenance import Spread, alike, relation
 from dejavu_torch.types import Traverse
 
 VISIT, FAST, PART = "second visit", "every third frame of it", "a third of it"
 OWN, BETWEEN = "every third of the map's frames", "odd frames on a map of the even ones"
 NETWORK = "another network"
 NUMBERS = 256  # of a descriptor of each network
-KEYS = ("chosen", "places", "same", "beyond", "steady", "correlation", "told")
+KEYS = ("chosen", "places", "same", "beyond", "both", "steady", "correlation", "told")
 COLUMNS: dict[str, Column] = {
-    **{"equal": ("same", ".2f"), "signs beyond": ("beyond", ".2f"), "parts": ("steady", ".2f")},
+    **{
+        "equal": ("same", ".2f"),
+        "signs beyond": ("beyond", ".2f"),
+        "of differing": ("both", ".2f"),
+        "parts": ("steady", ".2f"),
+    },
     "means": ("correlation", ".2f"),
 }
 LAPS = "{data}/rc_car_laps/frames?start="
@@ -64,8 +69,8 @@ def bench_route(name: str, route: Route) -> Iterator[Row]:
     """Rows of a route: a second visit as it is and cut, the map's own frames, and other networks.
 
     Yields:
-        places, same, beyond: see `Alike`, same as a share of them. steady, correlation: of ready descriptors
-        or, for other networks, of what each makes of the frames. told: what is said.
+        places, same, beyond, both: see `Alike`, same as a share of them. steady, correlation: of ready
+        descriptors or, for other networks, of what each makes of the frames. told: what is said.
     """
     reference, query = (kept(open_source(one)) for one in (route.reference, route.query))
     model = DejaVu().learn(reference)
@@ -94,9 +99,11 @@ def described(model: DejaVu, traverse: Traverse) -> Tensor:
 
 
 def related(model: DejaVu, queries: Tensor) -> Row:
-    found = alike(model.map.digest, digests_of(queries, follow=False))
-    same = found.same / max(1, found.places)
-    return {"places": found.places, "same": same, "beyond": found.beyond, "told": found.relation}
+    asked = digests_of(queries, follow=False)
+    places, same, beyond, both = alike(model.map.digest, asked)
+    told = relation(model.map, model.map.digest, asked)
+    shares = {"same": same / max(1, places), "beyond": beyond, "both": both}
+    return {"places": places, **shares, "told": told}
 
 
 def spread(reference: Traverse, query: Traverse) -> Row:

@@ -609,7 +609,8 @@ def provenance() -> str:
     table = [["", *ways, f"{OWN}: share of equal ones"]]
     for case, own in found.items():
         bold = ["**" * bool(own[way]["told"]) for way in ways]
-        cells = [f"{star}{own[way]['beyond']:.2f}{star}" for way, star in zip(ways, bold, strict=True)]
+        shares = [f"{own[way]['beyond']:.2f}, {own[way]['both']:.2f}" for way in ways]
+        cells = [f"{star}{share}{star}" for share, star in zip(shares, bold, strict=True)]
         name = f"{case}, chosen on" if own[VISIT]["chosen"] else case
         table.append([name, *cells, f"{own[OWN]['same']:.2f}"])
     known = [row for row in read("provenance")["rows"] if row.get("correlation") is not None]

@@ -25,13 +25,11 @@ ROWS = 256  # of ready descriptors whose mean is taken, at most
 # Chosen on every other route of `benchmarks provenance`, which tells of the others.
 SAME, FEWEST_SAME = 0.15, 8  # share of the places, and places, at least, that a query equals
 CHANGED = 3  # signs that change to the next frame, at least, so that equal ones tell something
-SPARSE = 22  # signs that change to the next frame, where a frame between both would look like neither
-BETWEEN, FEWEST_BETWEEN = 0.31, 32  # signs beyond both queries, as a share of those that change; places
+BETWEEN, BEYOND = 0.31, 0.41  # signs beyond both queries: of those that change, and of those that differ
+FEWEST_BETWEEN = {1: 32, 2: math.inf}  # places, by the dimensions of a layout: over areas nothing is told
 CORRELATED, STEADY = 0.25, 0.3  # means of other networks at most, and of parts of one drive at least
 LARGER = 4.0  # ratio of the sizes of one network's, at most
-WIDE, FEWEST_SPREAD = 16, 50  # dimensions, and descriptors, of fewer of which nothing is told
-
-ALONG = {1: True, 2: False}  # whether frames are taken one after the other, by the dimensions of a layout
+WIDE, FEWEST_SPREAD = 16, 50  # dimensions, and ready descriptors, of fewer of which little can be told
 
 Relation = Literal["", "frames", "between"]
 SEEN: dict[Relation, str] = {
@@ -134,11 +132,10 @@ class Provenance:
 
     def doubts(self, place_map: PlaceMap, digests: Tensor, queries: Traverse) -> list[Doubt]:
         """Why answers to queries may mislead, of which there are digests (Q,9)."""
-        lines, found = [self.unlike(queries)], alike(place_map.digest, digests).relation
-        images = len(queries.frame_shape) == 3  # a second visit of little noise lies between, too
-        found = found if found != "between" or (images and ALONG[place_map.layout.dimensions]) else ""
+        images = len(queries.frame_shape) == 3
+        lines, found = [self.unlike(queries)], relation(place_map, place_map.digest, digests, images)
         known = [(name, torch.tensor([*own], dtype=torch.uint8).view(-1, BYTES)) for name, own in self.taught]
-        names = [name for name, own in known if not found and alike(own, digests).relation]
+        names = [name for name, own in known if not found and relation(place_map, own, digests, images)]
         lines += [f"the queries are {SEEN[found]}: {SO}"] if found else []
         lines += [f"the queries taught this map ({', '.join(names)}): {SO}"] if names else []
         return [Doubt("provenance", line) for line in lines if line]
@@ -149,19 +146,23 @@ class Alike(NamedTuple):
 
     places: that are compared. same: of them that equal a query. beyond: signs in which places differ from
     both of two queries that follow each other, in proportion to those that change from a query, or a place,
-    to the next.
+    to the next; both: in proportion to those in which they differ from the nearest query.
     """
 
     places: int = 0
     same: int = 0
     beyond: float = math.inf
+    both: float = math.inf
 
-    @property
-    def relation(self) -> Relation:
-        """Whether the queries are frames of the map, or lie between them."""
-        if self.same >= max(FEWEST_SAME, SAME * self.places):
-            return "frames"
-        return "between" if self.places >= FEWEST_BETWEEN and self.beyond <= BETWEEN else ""
+
+def relation(place_map: PlaceMap, known: Tensor, asked: Tensor, images: bool = True) -> Relation:
+    """Whether queries are frames of a map, or of a drive that taught it, or lie between them; see `alike`.
+    Not of `images`, those of another visit with little noise lie between, too: of them that is not told."""
+    places, same, beyond, both = alike(known, asked)
+    if same >= max(FEWEST_SAME, SAME * places):
+        return "frames"
+    tells = places >= FEWEST_BETWEEN[place_map.layout.dimensions] and images
+    return "between" if tells and beyond <= BETWEEN and both <= BEYOND else ""
 
 
 def alike(known: Tensor, asked: Tensor) -> Alike:
@@ -184,18 +185,16 @@ def alike(known: Tensor, asked: Tensor) -> Alike:
     changed = torch.minimum(others, known[pairs, -1].float())
     differs = queries[at] != places
     beside = [queries[(at + step).clamp(0, len(queries) - 1)] != places for step in (-1, 1)]
-    beyond = torch.stack([(differs & one).sum(1) for one in beside]).amin(0)
+    beyond = float(torch.stack([(differs & one).sum(1) for one in beside]).amin(0).sum())
     same = int(((nearest == 0) & (changed >= CHANGED)).sum())
-    dense = len(changed) > 0 and float(known[pairs, -1].float().median()) <= SPARSE
-    return Alike(
-        len(places), same, float(beyond.sum()) / max(float(changed.sum()), 1e-9) if dense else math.inf
-    )
+    shares = (beyond / max(float(signs.sum()), 1e-9) for signs in (changed, nearest))
+    return Alike(len(places), same, *shares)
 
 
 def check_independent(place_map: PlaceMap, visit: Traverse, descriptors: Tensor) -> None:
     """Refuse to calibrate a map by its own drive; of ready descriptors between its frames only warn, since
     those of another visit with little noise look alike."""
-    found = alike(place_map.digest, digests_of(descriptors, follow=False)).relation
+    found = relation(place_map, place_map.digest, digests_of(descriptors, follow=False))
     line = f"calibrating by {visit.name}: it has {SEEN[found]}" if found else ""
     if found == "frames" or (found and len(visit.frame_shape) == 3):
         raise InputError(f"{line}; expected another visit")

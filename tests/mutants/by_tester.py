@@ -8,8 +8,8 @@ MUTANTS = [
     Mutant(
         "A frame is between two queries if it differs from both in few signs, not from one of them.",
         "dejavu_torch/recognition/provenance.py",
-        "beyond = torch.stack([(differs & one).sum(1) for one in beside]).amin(0)",
-        "beyond = differs.sum(1)",
+        "float(torch.stack([(differs & one).sum(1) for one in beside]).amin(0).sum())",
+        "float(differs.sum())",
         ("tests/recognition/test_provenance.py::-k dense",),
     ),
     Mutant(

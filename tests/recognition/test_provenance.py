@@ -20,7 +20,9 @@ from dejavu_torch.growth import append, average, learn_mean, merge, only_route
 from dejavu_torch.maps.digest import BYTES, PLACES, Digest, digests_of, signs_of
 from dejavu_torch.maps.file import read_map
 from dejavu_torch.model_file import state_from_json, state_to_json
+from dejavu_torch.places.layout import Layout
 from dejavu_torch.recognition.provenance import Alike, Provenance, Spread, alike
+from dejavu_torch.recognition.provenance import relation as related
 from dejavu_torch.recognition.querying import Querying
 from dejavu_torch.teaching import refine
 from dejavu_torch.updating import update
@@ -49,8 +51,11 @@ def learned(rows, **settings):
     return DejaVu(whitening="none", mapper=SpectralMapper(**settings)).learn(rows)
 
 
-def relation(known, asked):
-    return alike(known, asked).relation
+EMPTY = SpectralMapper().empty(torch.zeros(1, NUMBERS).bfloat16())
+
+
+def relation(known, asked, place_map=None):
+    return related(place_map or EMPTY, known, asked)
 
 
 class Heard(list):
@@ -131,6 +136,17 @@ def test_frames_between_those_of_a_map_are_told_where_these_are_dense():
     ):
         assert relation(digests_of(known), digests_of(queries)) in ("between", "frames")
     assert relation(digests_of(sparse[::2]), digests_of(sparse[1::2])) == ""
+
+
+def test_frames_between_others_are_not_told_over_an_area_or_in_few_dimensions():
+    rows = drive(800)
+    halves = digests_of(rows[::2]), digests_of(rows[1::2])
+    narrow = SpectralMapper().empty(torch.zeros(1, 9).bfloat16())
+    area = SpectralMapper().empty(torch.zeros(1, NUMBERS).bfloat16()).laid_out(Layout(20, 20))
+    assert relation(*halves) == "between"
+    for place_map in (narrow, area):
+        assert relation(*halves, place_map) == ""
+        assert relation(halves[0], halves[0], place_map) == "frames"
 
 
 def test_second_visits_are_not_told():
@@ -490,9 +506,9 @@ def test_second_visits_of_real_routes(name, data_dir):
     heard = Heard()
     list(model.matches(query, Querying(match="single"), heard=heard))
     lines = [str(doubt) for doubt in model.provenance.doubts(model.map, heard.digests, query)]
-    assert relation(model.map.digest, heard.digests) == expected
+    assert related(model.map, model.map.digest, heard.digests) == expected
     assert len(lines) == bool(expected)
     halves = [Part(reference, range(i, len(reference), 2)) for i in (0, 1)]
     model, heard = DejaVu().learn(halves[0]), Heard()
     list(model.matches(halves[1], Querying(match="single"), heard=heard))
-    assert relation(model.map.digest, heard.digests) == ("between" if name in DENSE else "")
+    assert related(model.map, model.map.digest, heard.digests) == ("between" if name in DENSE else "")
