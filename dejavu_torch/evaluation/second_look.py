@@ -27,7 +27,7 @@ from dejavu_torch.types import Doubt, Match, SequenceModel, Traverse
 
 QUERIES = 32  # that are looked at, in a row
 STARTS = 0.5, 0.25, 0.75  # shares of the drive, where they may begin
-SECONDS = 5.0
+SECONDS = 4.5  # after which no further look begins
 ANY_SPEED = [sum(one) / 3 for one in zip(MOVES, SLOW, FAST, strict=True)]  # which is fitted once
 ENOUGH = 0.5  # share of the queries that are found, from which on all is well
 
