@@ -17,7 +17,7 @@ from dejavu_torch.data.turning import TURNS
 from dejavu_torch.model import DejaVu
 from dejavu_torch.recognition.calibration import confidence_of
 from dejavu_torch.recognition.chosen import FAST, MOVES, SLOW
-from dejavu_torch.recognition.localizer import answer
+from dejavu_torch.recognition.localizer import Matching, answer
 from dejavu_torch.recognition.scorer import Scorer
 from dejavu_torch.recognition.select import PROBABLE
 from dejavu_torch.recognition.smoother import PlaceSmoother
@@ -27,7 +27,7 @@ from dejavu_torch.types import Doubt, Match, SequenceModel, Traverse
 
 QUERIES = 32  # that are looked at, in a row
 STARTS = 0.5, 0.25, 0.75  # shares of the drive, where they may begin
-SECONDS = 5.0
+SECONDS = 4.5  # after which no further look begins
 ANY_SPEED = [sum(one) / 3 for one in zip(MOVES, SLOW, FAST, strict=True)]  # which is fitted once
 ENOUGH = 0.5  # share of the queries that are found, from which on all is well
 
@@ -139,18 +139,15 @@ def second_look(model: DejaVu, query: Traverse, ordered: bool) -> list[Doubt]:
             if monotonic() < end and not torch.equal(altered, parts[i]):  # as grey ones
                 best, by = max((best, by), (see(altered), look), key=lambda one: one[0])
         gain = best.plainly - asis[i].plainly
-        if best.enough and gain >= CLEARLY[ordered]:
-            elsewhere = [(see(by.alter(parts[j])), asis[j]) for j in range(len(asis)) if j != i]
-            if any(plain.enough and one <= plain for one, plain in elsewhere):
-                continue
-            sure = not ordered or any(one.enough for one, _ in elsewhere)
-            told += (
-                [(gain, by.doubt(best.found, count, asis[i].found))]
-                if sure or gain >= 2 * CLEARLY[ordered]
-                else []
-            )
-            if sure:
-                break
+        if not best.enough or gain < CLEARLY[ordered]:
+            continue
+        elsewhere = [(see(by.alter(parts[j])), asis[j]) for j in range(len(asis)) if j != i]
+        worse = any(plain.enough and one <= plain for one, plain in elsewhere)
+        sure = not worse and (not ordered or any(one.enough for one, _ in elsewhere))
+        if sure or (not worse and gain >= 2 * CLEARLY[ordered]):
+            told.append((gain, by.doubt(best.found, count, asis[i].found)))
+        if sure:
+            break
     return [doubt for _, doubt in sorted(told, reverse=True)[:1]]
 
 
@@ -169,7 +166,8 @@ def _alone(model: DejaVu, frames: Tensor) -> Seen:
         sure = partial(confidence_of, layout=scorer.layout)
         known = singly(scorer.rows, scorer.null, torch.ones(len(frames)), sure)
         plainly = 1 - known.shown / min(known.null, -1e-9)
-    return _seen(answer(scorer, model.matching(None)), plainly >= SURE, plainly)
+    match = answer(scorer, Matching(platt=model.calibration and model.calibration.single))
+    return _seen(match, plainly >= SURE, plainly)
 
 
 def _scorer(model: DejaVu, frames: Tensor) -> Scorer:

@@ -27,6 +27,27 @@ MUTANTS = [
         ("tests/recognition/test_provenance.py::-k average_leave",),
     ),
     Mutant(
+        "Frames are turned clockwise.",
+        "dejavu_torch/data/turning.py",
+        '"90": lambda frames: frames.rot90(-1, (-2, -1)),',
+        '"90": lambda frames: frames.rot90(1, (-2, -1)),',
+        ("tests/data/test_turning.py::-k other_programs",),
+    ),
+    Mutant(
+        "A map whose descriptor has changed fails its check.",
+        "dejavu_torch/cli/commands.py",
+        "expect(distance <= TOLERANCE,",
+        "expect(distance <= 1,",
+        ("tests/features/test_probe.py::-k info_tells",),
+    ),
+    Mutant(
+        "A drive that only its motion shows is looked at again.",
+        "dejavu_torch/evaluation/second_look.py",
+        "(denied or not way.is_drive)",
+        "(not way.is_drive)",
+        ("tests/evaluation/test_second_look.py::-k deny",),
+    ),
+    Mutant(
         "The frame of a reference video that the page asks for is decoded before all others.",
         "dejavu_torch/live/page.py",
         "at = max(0, asked - BEFORE // step * step)",
