@@ -164,7 +164,8 @@ def read_odometer(table: Table, traverse: Traverse) -> Odometer:
     expect("moved" in table and table.rows, MOVED, f"{table}, and {len(table)} rows")
     roles = [role for role in ("moved", "moved_spread") if role in table]
     columns = [table.header[table.at(role)] for role in roles]
-    table = table.distinct() if "time" in table else table
+    if "time" in table:
+        table = table.distinct()
     unit, titles = columns[0].unit, " and ".join(column.title for column in columns)
     expect(columns[-1].unit in (None, unit), "one unit", f"{table.path} has the columns {titles}")
     cells = [table.text(role) for role in roles]

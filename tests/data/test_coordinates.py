@@ -234,7 +234,7 @@ def test_heights_are_compared_only_if_both_visits_have_them(tmp_path, caplog):
     one, other = coordinates_of([three, three], "metres")
     assert one[1].tolist() == [1, 10, -7]  # the height last
     (tmp_path / "g.csv").write_text("x,y,z\n" + "\n".join(f"{i},{10 * i},7" for i in range(3)))
-    two.coordinates, _ = read_coordinates(tmp_path / "g.csv", two)
+    two.coordinates, *_ = read_coordinates(tmp_path / "g.csv", two)
     one, other = coordinates_of([three, two], "metres")
     assert one.tolist() == other.tolist() == [[0, 0], [1, 10], [2, 20]]
     assert "poses has coordinates of another axis for heights" in caplog.text
