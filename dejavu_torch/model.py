@@ -689,7 +689,7 @@ class DejaVu(nn.Module):
                 some = Part(one, range(0, len(one), -(-len(one) // PLACES)))
                 if (known >= 0).any() and self.descriptor.fits(self.map.dimension, some):
                     digests = digests_of(self.descriptor.all_of(some), follow=False)
-                    self.provenance = self.provenance.taught_by(one.name, digests)
+                    self.provenance = self.provenance.taught_by(Path(one.name).name, digests)
         return self
 
     def look_at(self, visit: Traverse | AugmentedFrames) -> DejaVu:

@@ -255,7 +255,8 @@ def test_the_command(tmp_path, capsys):
 
 
 def test_the_documentation_runs_and_a_filter_goes_from_state_to_state(tmp_path, monkeypatch, capsys):
-    page = (Path(__file__).parents[1] / "docs" / "howto" / "export.md").read_text()
+    pages = Path(__file__).parents[1] / "docs" / "howto"
+    page = "\n".join((pages / f"{name}.md").read_text() for name in ("export", "deployment"))
     monkeypatch.chdir(tmp_path)
     frame = open_source("sim:aerial?frames=64&traverse=1")[40]
     Image.fromarray((frame * 255).byte().permute(1, 2, 0).numpy()).save("frame.png")
@@ -369,7 +370,7 @@ struct Session {
 
 @pytest.mark.skipif(not shutil.which("g++"), reason="no C++ compiler")
 def test_the_documentations_cpp_compiles(tmp_path):
-    page = (Path(__file__).parents[1] / "docs" / "howto" / "export.md").read_text()
+    page = (Path(__file__).parents[1] / "docs" / "howto" / "deployment.md").read_text()
     (code,) = re.findall(r"```cpp\n(.*?)```", page, re.DOTALL)
     for name, text in (USED | {"check.cpp": code}).items():
         (tmp_path / name).write_text(text)

@@ -123,7 +123,7 @@ class Table:
     def __str__(self) -> str:
         if self.header:
             return f"{self.path} has the columns {', '.join(column.title for column in self.header)}"
-        known = f"{len(self.rows[0][1])} columns without a header" if self.rows else "no columns"
+        known = f"{len(self.rows[0][1])} columns without a header" if self.rows else "no rows and no columns"
         return f"{self.path} has {known}"
 
 

@@ -15,7 +15,7 @@ from torch import Tensor
 from dejavu_torch.data.traverse import Part
 from dejavu_torch.maps.digest import BITS, BYTES, digests_of, signs_of
 from dejavu_torch.maps.place_map import PlaceMap
-from dejavu_torch.types import Doubt, Facts, InputError, Traverse
+from dejavu_torch.types import Doubt, Facts, Traverse, expect
 
 log = logging.getLogger("dejavu_torch")
 
@@ -25,6 +25,7 @@ ROWS = 256  # of ready descriptors whose mean is taken, at most
 # Chosen on every other route of `benchmarks provenance`, which tells of the others.
 SAME, FEWEST_SAME = 0.15, 8  # share of the places, and places, at least, that a query equals
 CHANGED = 3  # signs that change to the next frame, at least, so that equal ones tell something
+OWN = 0.9  # share of all places, from which on a visit is the map's own drive
 BETWEEN, BEYOND = 0.31, 0.41  # signs beyond both queries: of those that change, and of those that differ
 FEWEST_BETWEEN = {1: 32, 2: math.inf}  # places, by the dimensions of a layout: over areas nothing is told
 CORRELATED, STEADY = 0.25, 0.3  # means of other networks at most, and of parts of one drive at least
@@ -192,11 +193,12 @@ def alike(known: Tensor, asked: Tensor) -> Alike:
 
 
 def check_independent(place_map: PlaceMap, visit: Traverse, descriptors: Tensor) -> None:
-    """Refuse to calibrate a map by its own drive; of ready descriptors between its frames only warn, since
-    those of another visit with little noise look alike."""
-    found = relation(place_map, place_map.digest, digests_of(descriptors, follow=False))
+    """Refuse to calibrate a map by its own drive, and warn of another that looks as some of it does: those of
+    another visit with little noise do, too."""
+    digests = digests_of(descriptors, follow=False)
+    found = relation(place_map, place_map.digest, digests)
     line = f"calibrating by {visit.name}: it has {SEEN[found]}" if found else ""
-    if found == "frames" or (found and len(visit.frame_shape) == 3):
-        raise InputError(f"{line}; expected another visit")
+    equal = (signs_of(place_map.digest.cpu()) @ signs_of(digests).T == BITS).any(1).double().mean()
+    expect(not found or equal < OWN or place_map.dimension < WIDE, "another visit", line)
     if found:
         log.warning("%s; probabilities may be too high", line)
