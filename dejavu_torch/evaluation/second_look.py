@@ -130,7 +130,12 @@ def second_look(model: DejaVu, query: Traverse, ordered: bool) -> list[Doubt]:
     some = some if ordered else [range(0, len(query) - len(query) % count, len(query) // count)]
     size = own[0], *reduced_size((own[1], own[2]), max(shape[1:]))
     parts = [fitted(Part(query, numbers), size)[:] for numbers in some]
-    asis = [see(frames) for frames in parts]
+    began, asis = monotonic(), list[Seen]()
+    for frames in (parts[0][:1], *parts):  # one first, and then half of the time: features may be slow
+        asis.append(see(frames))
+        if (monotonic() - began) * (count if len(asis) == 1 else 2) > SECONDS:
+            return []
+    del asis[0]
     lost, told = [i for i, one in enumerate(asis) if not one.enough], list[tuple[float, Doubt]]()
     for i in lost if 2 * len(lost) >= len(asis) else ():
         best, by = asis[i], BGR

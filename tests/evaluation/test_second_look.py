@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from torch import nn
 from command_line import run
 from helpers import refused
 
@@ -192,3 +193,25 @@ def test_a_refusal_of_frames_whose_sides_are_exchanged_names_turns():
     with pytest.raises(InputError) as square:
         model.localize(torch.rand(2, 1, 256, 256))
     assert "turn" not in str(square.value)
+
+
+class Slow(nn.Module):
+    """Features whose clock goes on by so many seconds a frame."""
+
+    seconds, now = 0.0, 0.0
+
+    def forward(self, frames):
+        self.now += self.seconds * len(frames)
+        return nn.functional.adaptive_avg_pool2d(frames, 8).flatten(1)
+
+
+@pytest.mark.parametrize("seconds", [0.02, 0.1, 1.0])
+def test_slow_features_do_not_make_a_look_long(seconds, monkeypatch):
+    reference, query = (open_source(f"sim:aerial?frames=100&traverse={traverse}") for traverse in (0, 1))
+    features = Slow()
+    model = DejaVu(features).learn(reference).calibrate(reference)
+    monkeypatch.setattr(looking, "SECONDS", 4.5)
+    monkeypatch.setattr(looking, "monotonic", lambda: features.now)
+    features.seconds, features.now = seconds, 0.0
+    second_look(model, Frames(query[:].flip(-1)), ordered=True)
+    assert features.now < 7
