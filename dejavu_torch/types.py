@@ -234,7 +234,7 @@ class Odometer(NamedTuple):
 
     def times(self, scale: float) -> Odometer:
         """In places, by those in one of the unit."""
-        return Odometer(self.values * torch.tensor([scale, scale**2], dtype=torch.float64))
+        return Odometer(self.values * torch.tensor([scale, scale * scale], dtype=torch.float64))
 
 
 @dataclass(frozen=True)

@@ -35,7 +35,8 @@ def checked_moved(told: Moved, queries: int) -> Odometer:
         expect(fits, "as many places moved, each since the query before", seen)
         moved = moved.where(torch.arange(queries) > 0, 0.0)
         told = Odometer(torch.stack([moved, spread.square().expand(queries)], 1).cumsum(0))
-    moved = told.moves[:, 0]
+    expect(queries in (0, len(told.values)), f"{queries} queries", f"moved is of {len(told.values)} queries")
+    moved = told.times(max(paces(told))).moves[:, 0]  # of metres, as many places as there may be
     for query, one in enumerate(moved.tolist()):
         check_move(one, f" at query {query}")
     mean = float(moved.mean()) if queries else 0.0
@@ -59,16 +60,16 @@ def moves_of(
     elif told is None and (told := queries.odometer) is None:
         expect(metres is None, "moves in metres", f"{metres} metres a place, and no moves")
         return None
-    odometer = checked_moved(told, len(queries))
     if metres is None:
-        return odometer
+        return checked_moved(told, len(queries))
     each = as_number(str(metres))
     if each is None:
         way = odometer_of(open_source(str(metres))).values[:, 0]
         each = float(way[~way.isnan()].diff().mean())
+    odometer = told if isinstance(told, Odometer) else checked_moved(told, len(queries))
     seen = f"{metres} metres a place, and moves in {'metres' if odometer.metres else 'places'}"
     expect(each > 0 and odometer.metres, "a number above 0, and metres", seen)
-    return odometer.times(1 / each)
+    return checked_moved(odometer.times(1 / each), len(queries))
 
 
 def check_move(moved: float, where: str = "") -> None:

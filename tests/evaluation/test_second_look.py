@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from torch import nn
 from command_line import run
 from helpers import refused
+from torch import nn
 
 from dejavu_torch import HOG, DejaVu, Preprocess, SpectralMapper, Whitening, open_source
 from dejavu_torch.data.arrays import ArrayTraverse

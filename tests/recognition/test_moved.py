@@ -32,6 +32,7 @@ from dejavu_torch.recognition import chosen, engine, large, odometry
 from dejavu_torch.recognition.drive import DriveQuery, localize_drives, speed_of
 from dejavu_torch.recognition.engine import Rates
 from dejavu_torch.recognition.motion import AlongRoute
+from dejavu_torch.recognition.odometry import moves_of
 from dejavu_torch.recognition.scorer import OfRows
 from dejavu_torch.recognition.smoother import rows_of
 from dejavu_torch.recognition.speeds import FREE, steady
@@ -395,6 +396,8 @@ def test_what_cannot_be_moves_is_refused(model, route, tmp_path):
     with refused("moved is nan at query 2"):
         model.localize(queries, sequence=smoother, moved=fits.index_fill(0, torch.tensor(2), math.nan))
     for wrong in (19, 21):
+        with refused(f"moved is of {wrong} queries", "20 queries"):
+            model.localize(queries, sequence=smoother, moved=Odometer(torch.zeros(wrong, 2)))
         with refused(f"moved is ({wrong},) for 20 queries"):
             model.localize(queries, sequence=PlaceSmoother(moved=torch.ones(wrong)))
     with refused("a path, and places moved", "posterior"):
@@ -420,3 +423,15 @@ def test_a_filter_that_learns_its_moves_still_does(filter):
     if filter.layout.dimensions == 2:
         with refused("places moved, and the map of an area", "a route"):
             filter.step(scores, filter.start(50), moved=torch.ones(90))
+
+
+def test_limits_are_of_places_not_of_metres(route):
+    """A train has more than 100 metres to a frame, and a tunnel more than 1000."""
+    at, moved = irregular(150, 300)
+    metres, source = 500.0 * torch.cat([moved[:1] * 0, moved[1:]]).double(), ArrayTraverse(route[at])
+    odometer = Odometer(torch.stack([metres, metres * math.nan], 1).cumsum(0), True)
+    assert moves_of(source, odometer, None) is odometer
+    assert torch.allclose(moves_of(source, odometer, 500).moves[1:, 0], moved[1:].double())
+    for each in (0.1, 1e-300):
+        with refused("moved is"):
+            moves_of(source, odometer, each)
