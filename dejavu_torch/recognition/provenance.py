@@ -158,7 +158,10 @@ class Alike(NamedTuple):
 
 def relation(place_map: PlaceMap, known: Tensor, asked: Tensor, images: bool = True) -> Relation:
     """Whether queries are frames of a map, or of a drive that taught it, or lie between them; see `alike`.
-    Not of `images`, those of another visit with little noise lie between, too: of them that is not told."""
+    Not of `images`, those of another visit with little noise lie between, too: of them that is not told, and
+    of few dimensions nothing, whose signs are few."""
+    if not images and place_map.dimension < WIDE:
+        return ""
     places, same, beyond, both = alike(known, asked)
     if same >= max(FEWEST_SAME, SAME * places):
         return "frames"
@@ -196,7 +199,8 @@ def check_independent(place_map: PlaceMap, visit: Traverse, descriptors: Tensor)
     """Refuse to calibrate a map by its own drive, and warn of another that looks as some of it does: those of
     another visit with little noise do, too."""
     digests = digests_of(descriptors, follow=False)
-    found = relation(place_map, place_map.digest, digests)
+    tells = len(visit.frame_shape) == 3 or place_map.dimension >= WIDE
+    found = relation(place_map, place_map.digest, digests, tells)
     line = f"calibrating by {visit.name}: it has {SEEN[found]}" if found else ""
     equal = (signs_of(place_map.digest.cpu()) @ signs_of(digests).T == BITS).any(1).double().mean()
     expect(not found or equal < OWN or place_map.dimension < WIDE, "another visit", line)

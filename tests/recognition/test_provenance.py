@@ -138,13 +138,16 @@ def test_frames_between_those_of_a_map_are_told_where_these_are_dense():
     assert relation(digests_of(sparse[::2]), digests_of(sparse[1::2])) == ""
 
 
-def test_frames_between_others_are_not_told_over_an_area():
+def test_frames_between_others_are_not_told_over_an_area_nor_of_few_ready_numbers():
     rows = drive(800)
     halves = digests_of(rows[::2]), digests_of(rows[1::2])
+    narrow = SpectralMapper().empty(torch.zeros(1, 9).bfloat16())
     area = SpectralMapper().empty(torch.zeros(1, NUMBERS).bfloat16()).laid_out(Layout(20, 20))
     assert relation(*halves) == "between"
     assert relation(*halves, area) == ""
     assert relation(halves[0], halves[0], area) == "frames"
+    for images, told in ((True, "frames"), (False, "")):  # frames of a short route have few dimensions, too
+        assert related(narrow, halves[0], halves[0], images) == told
 
 
 def test_second_visits_are_not_told():
@@ -162,6 +165,18 @@ def test_second_visits_are_not_told():
         (rows, torch.zeros(50, NUMBERS)),
     ):
         assert relation(digests_of(known), digests_of(queries)) == ""
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_second_visits_of_few_ready_numbers_are_not_told_and_calibrate(seed):
+    """Of 5 numbers, 64 signs are mostly the same few, and many equal by chance."""
+    rows = torch.nn.functional.avg_pool1d(random(5, 408, seed=seed), 9, 1).T
+    visit = rows + 0.1 * rows.std() * random(400, 5, seed=seed + 10)
+    model = learned(rows)
+    digests = digests_of(model.descriptor.all_of(ArrayTraverse(visit)), follow=False)
+    assert model.provenance.doubts(model.map, digests, ArrayTraverse(visit)) == []
+    model.calibrate(None, LabelledFrames(ArrayTraverse(visit, "visit"), torch.arange(400)))
+    assert model.calibration is not None
 
 
 def test_too_few_tell_nothing():
