@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import math
 from base64 import b64decode, b64encode
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple
 
@@ -20,6 +20,7 @@ from dejavu_torch.types import Doubt, Facts, Traverse, expect
 log = logging.getLogger("dejavu_torch")
 
 ASKED = 2**17  # queries that are looked at, the first ones
+AT_ONCE = 16  # places that are compared with all queries
 ROWS = 256  # of ready descriptors whose mean is taken, at most
 
 # Chosen on every other route of `benchmarks provenance`, which tells of the others.
@@ -181,11 +182,12 @@ def alike(known: Tensor, asked: Tensor) -> Alike:
     if min(len(known), len(asked)) < FEWEST_SAME:
         return Alike()
     places, queries = signs_of(known), signs_of(asked)
-    apart = (BITS - places @ queries.T) / 2
-    nearest, at = apart.min(1)
-    pairs = nearest == apart.amin(0)[at]
+    found = [(*apart.min(1), apart.amin(0, True)) for apart in _apart(places, queries)]
+    nearest, at, own = map(torch.cat, zip(*found, strict=True))
+    pairs = nearest == own.amin(0)[at]
     places, nearest, at = places[pairs], nearest[pairs], at[pairs]
-    others = ((BITS - queries[at] @ queries.T) / 2).scatter_(1, at[:, None], BITS).amin(1)
+    each = zip(_apart(queries[at], queries), at.split(AT_ONCE), strict=True)
+    others = torch.cat([apart.scatter_(1, one[:, None], BITS).amin(1) for apart, one in each])
     changed = torch.minimum(others, known[pairs, -1].float())
     differs = queries[at] != places
     beside = [queries[(at + step).clamp(0, len(queries) - 1)] != places for step in (-1, 1)]
@@ -193,6 +195,11 @@ def alike(known: Tensor, asked: Tensor) -> Alike:
     same = int(((nearest == 0) & (changed >= CHANGED)).sum())
     shares = (beyond / max(float(signs.sum()), 1e-9) for signs in (changed, nearest))
     return Alike(len(places), same, *shares)
+
+
+def _apart(rows: Tensor, queries: Tensor) -> Iterator[Tensor]:
+    """Signs in which some rows (n,64) differ from each of the queries (Q,64): (at most `AT_ONCE`,Q)."""
+    return ((BITS - part @ queries.T).div_(2) for part in rows.split(AT_ONCE))
 
 
 def check_independent(place_map: PlaceMap, visit: Traverse, descriptors: Tensor) -> None:

@@ -10,6 +10,7 @@ import pytest
 import torch
 from command_line import fails, run
 from helpers import long_from, refused
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from dejavu_torch import HOG, DejaVu, Preprocess, SpectralMapper, Whitening, compare, open_source
 from dejavu_torch.data.arrays import ArrayTraverse
@@ -177,6 +178,21 @@ def test_second_visits_of_few_ready_numbers_are_not_told_and_calibrate(seed):
     assert model.provenance.doubts(model.map, digests, ArrayTraverse(visit)) == []
     model.calibrate(None, LabelledFrames(ArrayTraverse(visit, "visit"), torch.arange(400)))
     assert model.calibration is not None
+
+
+def test_places_are_compared_with_many_queries_in_little_memory():
+    class Largest(TorchDispatchMode):
+        numbers = 0
+
+        def __torch_dispatch__(self, function, types, args=(), kwargs=None):
+            out = function(*args, **(kwargs or {}))
+            self.numbers = max(self.numbers, out.numel() if isinstance(out, torch.Tensor) else 0)
+            return out
+
+    known, asked = digests_of(drive(256)), digests_of(drive(20_000, seed=1))
+    with Largest() as largest:
+        alike(known, asked)
+    assert largest.numbers <= 64 * 20_000  # the signs themselves
 
 
 def test_too_few_tell_nothing():
