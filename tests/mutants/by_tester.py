@@ -1370,7 +1370,7 @@ MUTANTS = [
     Mutant(
         "A spread counts in the unit of the odometer.",
         "dejavu_torch/types.py",
-        "[scale, scale**2]",
+        "[scale, scale * scale]",
         "[scale, scale]",
         ("tests/recognition/test_moved.py::-k unit",),
     ),
