@@ -186,8 +186,11 @@ def odometer_of(traverse: Traverse) -> Odometer:
     expect(own is not None and own.frame != "pixels", expected, f"{traverse.name} without coordinates")
     (at,) = coordinates_of([traverse], "metres")
     known = ~at.isnan().any(1)
+    expect(bool(known.any()), "those of some frames", f"{traverse.name} has no coordinates of its frames")
     way = F.pad(at[known].diff(dim=0).norm(dim=1), (1, 0)).cumsum(0)
-    even = np.interp(np.arange(len(at)), known.nonzero()[:, 0], way, math.nan, math.nan)
+    frames, seen = np.arange(len(at)), known.nonzero()[:, 0].numpy()
+    beyond = frames - frames.clip(seen[0], seen[-1])  # of the fixes, which the mean speed continues
+    even = np.interp(frames, seen, way) + beyond * float(way[-1]) / max(1, seen[-1] - seen[0])
     return Odometer(torch.from_numpy(np.stack([even, np.full(len(at), math.nan)], 1)), True)
 
 

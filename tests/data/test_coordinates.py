@@ -330,7 +330,9 @@ def test_coordinates_tell_what_an_odometer_would_read():
     places = [[NAN, NAN], [0, 0], [3, 4], [NAN, NAN], [3, 10], [3, 10], [NAN, NAN]]
     traverse.coordinates = Coordinates(torch.tensor(places).double())
     read = odometer_of(traverse)
-    np.testing.assert_allclose(read.values[:, 0], [NAN, 0, 5, 8, 11, 11, NAN])
+    np.testing.assert_allclose(read.values[:, 0], [-2.75, 0, 5, 8, 11, 11, 13.75])
+    with refused("has no coordinates of its frames"):
+        odometer_of(traverse.changed(coordinates=Coordinates(torch.full((7, 2), NAN).double())))
     assert read.metres
     degrees = torch.tensor([[48.0, 11.0], [48.001, 11.0]]).double()
     two = ArrayTraverse(torch.rand(2, 4), "two")

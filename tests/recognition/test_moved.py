@@ -36,7 +36,7 @@ from dejavu_torch.recognition.odometry import moves_of
 from dejavu_torch.recognition.scorer import OfRows
 from dejavu_torch.recognition.smoother import rows_of
 from dejavu_torch.recognition.speeds import FREE, steady
-from dejavu_torch.types import Odometer
+from dejavu_torch.types import Coordinates, Odometer
 
 SLIP = chosen.ODOMETRY / 2
 ONE = (SLIP, 1 - 2 * SLIP, SLIP)
@@ -435,3 +435,12 @@ def test_limits_are_of_places_not_of_metres(route):
     for each in (0.1, 1e-300):
         with refused("moved is"):
             moves_of(source, odometer, each)
+
+
+def test_coordinates_that_begin_late_and_end_early_move_evenly_there(route):
+    """As of a receiver that has no fix yet; it was refused as nan."""
+    at = torch.stack([2.0 * torch.arange(40), torch.zeros(40)], 1).double()
+    at[:11], at[20], at[35:] = math.nan, math.nan, math.nan
+    source = ArrayTraverse(route[:40]).changed(coordinates=Coordinates(at))
+    odometer = moves_of(source, "coordinates", None)
+    assert odometer.moves[1:, 0].tolist() == pytest.approx([2.0] * 39)
