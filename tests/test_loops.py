@@ -109,7 +109,7 @@ def test_a_place_that_only_some_queries_see_is_no_hole():
     assert match.accepted[210:390].double().mean() > 0.9
 
 
-MOVES = torch.randn(300, 4, generator=torch.Generator().manual_seed(0))
+MOVES = torch.randn(300, 8, generator=torch.Generator().manual_seed(0))
 
 
 @pytest.mark.parametrize("queries", [torch.zeros(0, 3), torch.ones(1, 3), MOVES, torch.ones(30, 2)])
