@@ -117,17 +117,17 @@ def run_localize(
         print(chosen)
     if querying.loops is None and not all(way.is_drive for way in ways):
         print(NO_DRIVE)
-    if querying.loops is None:
-        for doubt in model.provenance.doubts(model.map, torch.cat(digests), query):
-            say(str(doubt))
     if damaged:
         one, many = min(damaged), len(damaged)
         print(f"{many} frame{'s' * (many > 1)} could not be read, such as {one}: {damaged[one]}")
     say(f"{total} queries, {accepted} accepted; written to {out}")
-    told = bool(counts) and querying.loops is None and cluster is None
+    itself = querying.loops is not None
+    doubts = [] if itself else model.provenance.doubts(model.map, torch.cat(digests), query)
+    told = bool(counts) and not itself and cluster is None
     if told and is_doubtful(counts[f"{PROBABLE:g}"], total, next(iter(ways), None)):
-        for doubt in second_look(model, query, bool(ordered)):
-            say(str(doubt))
+        doubts += second_look(model, query, bool(ordered))
+    for doubt in doubts:
+        say(str(doubt))
     if counts:
         steps = next_steps(matcher is not None and querying.loops is None, chosen.given)
         probable = f"{describe_probable(counts, total)}, of being within {TOLERANCE} places"

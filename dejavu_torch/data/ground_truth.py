@@ -22,14 +22,7 @@ from torch.nn.utils.rnn import pad_sequence
 from dejavu_torch.data.coordinates import FORMS as COORDINATES
 from dejavu_torch.data.coordinates import OF_MAPS, Near, coordinates_of
 from dejavu_torch.data.files import LARGEST, as_number, check_regular
-from dejavu_torch.data.truth_files import (
-    look_like_seconds,
-    places_of_queries,
-    read_csv,
-    read_json,
-    read_matrices,
-    until,
-)
+from dejavu_torch.data.truth_files import places_of_queries, read_json, read_listed, read_matrices
 from dejavu_torch.memory import check_room
 from dejavu_torch.places.layout import Layout
 from dejavu_torch.text import one_line, rounded
@@ -367,18 +360,7 @@ def find_ground_truth(
     else:
         length = len(query) if query is not None else None
         if parsed.suffix.lower() == ".csv":
-            more = 0 if reference is None else reference.beyond
-            listed = read_csv(parsed, None if frames is None else frames + more, interpolate)
-            listed = until(listed, query, reference, parsed)
-            if length is not None and frames is not None and look_like_seconds(listed, length, frames):
-                ends = (
-                    max(listed),
-                    length,
-                    max(place for places in listed.values() for place in places),
-                    frames,
-                )
-                line = "%s ends at query %d of %d and place %d of %d: does it count seconds, not frames?"
-                log.warning(line, parsed, *ends)
+            listed = read_listed(parsed, query, reference, frames, interpolate)
         else:
             count = len(numbers) if all_frames else length
             listed = read_json(parsed, frames, count, int(numbers.max()) + 1)

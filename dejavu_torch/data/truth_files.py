@@ -68,6 +68,20 @@ def _to_queries(listed: Listed, frames: Tensor) -> Listed:
     return moved
 
 
+def read_listed(
+    path: Path, query: Traverse | None, reference: Traverse | None, frames: int | None, interpolate: bool
+) -> Listed:
+    """As `read_csv`, up to a `stop=` of the sources; asks whether the file counts seconds if it looks so."""
+    more = 0 if reference is None else reference.beyond
+    listed = read_csv(path, None if frames is None else frames + more, interpolate)
+    listed = until(listed, query, reference, path)
+    if query is not None and frames is not None and look_like_seconds(listed, len(query), frames):
+        last = max(place for places in listed.values() for place in places)
+        line = "%s ends at query %d of %d and place %d of %d: does it count seconds, not frames?"
+        log.warning(line, path, max(listed), len(query), last, frames)
+    return listed
+
+
 def until(listed: Listed, query: Traverse | None, reference: Traverse | None, name: object) -> Listed:
     """Without queries and places that a `stop=` of their sources left out, which are counted in one line."""
     ends = [LARGEST if source is None or not source.beyond else len(source) for source in (query, reference)]
