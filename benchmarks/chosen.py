@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from statistics import mean
 from typing import NamedTuple
@@ -10,15 +11,25 @@ from typing import NamedTuple
 from torch import Tensor
 from tqdm import tqdm
 
-from benchmarks.drives import AS_IT_WAS, ELSEWHERE, HALF, ROUTES, Known, above, asked, drives_of, learned
-from benchmarks.measure import Column, Row, table, write_bench
+from benchmarks.drives import (
+    AS_IT_WAS,
+    ELSEWHERE,
+    HALF,
+    ROUTES,
+    Known,
+    above,
+    asked,
+    drives_of,
+    learned,
+)
+from benchmarks.measure import Column, Row, some_of, table, write_bench
 from dejavu_torch.data.ground_truth import GroundTruth
 from dejavu_torch.evaluation.curves import evaluate
 from dejavu_torch.evaluation.rejection import calibration_error, judged
 from dejavu_torch.recognition import chosen
 from dejavu_torch.recognition.smoother import PlaceSmoother
 from dejavu_torch.teaching import in_its_light
-from dejavu_torch.types import InputError
+from dejavu_torch.types import Match
 
 DRIVES = (AS_IT_WAS, "a third of the speed", "three times the speed", "a stop", "stretches of 5 to 15", HALF)
 AS_IT_IS = "as it is"
@@ -42,6 +53,12 @@ class Asked(NamedTuple):
     queries: Tensor
     truth: GroundTruth
 
+    def matched(self) -> Match:
+        """By the whole drive."""
+        model, tolerance = self.known.model, self.known.tolerance
+        matching = model.matching(PlaceSmoother(within=tolerance))._replace(radius=tolerance)
+        return model.localize_descriptors(self.queries, matching)
+
 
 def run_chosen(
     data: Path, *, out: Path, routes: Sequence[str] = (), constants: Sequence[str] = ()
@@ -54,15 +71,10 @@ def run_chosen(
         routes: names of routes, as of `drives`; all if not given
         constants: names of constants, in capitals; all if not given
     """
-    for names, known in ((routes, [*ROUTES]), (constants, [*HALVED, *LISTS])):
-        if unknown := [name for name in names if name not in known]:
-            raise InputError(f"{unknown[0]!r} is unknown; expected one of {', '.join(map(repr, known))}")
-    drives = [
-        one
-        for name in tqdm(routes or ROUTES, "maps", disable=None, leave=False)
-        for one in _asked(data, name)
-    ]
-    settings = [(AS_IT_IS, {}), *(pair for name in constants or (*HALVED, *LISTS) for pair in _others(name))]
+    names = some_of((*HALVED, *LISTS), constants)
+    maps = tqdm(some_of(ROUTES, routes), "maps", disable=None, leave=False)
+    drives = [one for name in maps for one in _asked(data, name)]
+    settings = [(AS_IT_IS, {}), *(pair for name in names for pair in _others(name))]
     rows: list[Row] = []
     base: dict[str, float] = {}
     for name, values in tqdm(settings, "constants", disable=None, leave=False):
@@ -97,27 +109,32 @@ def _others(name: str) -> Iterator[tuple[str, dict[str, object]]]:
         yield f"{name} {value:g}: {other:g}", {name: other}
 
 
-def _row(
-    name: str, values: dict[str, object], drives: list[Asked], base: dict[str, float]
-) -> tuple[Row, dict[str, float]]:
+@contextmanager
+def changed(values: dict[str, object]) -> Iterator[None]:
+    """With other values of constants."""
     before = {name: getattr(chosen, name) for name in values}
-    auc: dict[str, float] = {}
-    errors, elsewhere = [], []
     try:
         for key, value in values.items():
             setattr(chosen, key, value)
+        yield
+    finally:
+        for key, value in before.items():
+            setattr(chosen, key, value)
+
+
+def _row(
+    name: str, values: dict[str, object], drives: list[Asked], base: dict[str, float]
+) -> tuple[Row, dict[str, float]]:
+    auc: dict[str, float] = {}
+    errors, elsewhere = [], []
+    with changed(values):
         for one in drives:
-            smoother, tolerance = PlaceSmoother(within=one.known.tolerance), one.known.tolerance
-            matching = one.known.model.matching(smoother)._replace(radius=tolerance)
-            match = one.known.model.localize_descriptors(one.queries, matching)
+            match, tolerance = one.matched(), one.known.tolerance
             if one.name.endswith(ELSEWHERE):
                 elsewhere.append(above(match, 0.5))
                 continue
             auc[one.name] = evaluate(match, one.truth, tolerance).auc
             errors.append(calibration_error(*judged(match, one.truth, tolerance)))
-    finally:
-        for key, value in before.items():
-            setattr(chosen, key, value)
     changes = {key: auc[key] - base.get(key, auc[key]) for key in auc}
     least, most = min(changes, key=changes.__getitem__), max(changes, key=changes.__getitem__)
     row: Row = {

@@ -14,7 +14,7 @@ from tqdm import tqdm
 
 from benchmarks.large_drives import COLUMNS as LARGE
 from benchmarks.large_drives import TASKS, bench_large_drives
-from benchmarks.measure import Column, Row, new_row, table, truth_of, write_bench
+from benchmarks.measure import Column, Row, new_row, some_of, table, truth_of, write_bench
 from benchmarks.trainings import Route, drive
 from dejavu_torch.data.ground_truth import GroundTruth
 from dejavu_torch.data.source import open_source
@@ -22,10 +22,11 @@ from dejavu_torch.data.traverse import fitted
 from dejavu_torch.evaluation.curves import evaluate
 from dejavu_torch.evaluation.rejection import calibration_error, judged
 from dejavu_torch.growth import calibrate_if_possible
+from dejavu_torch.maps.spectral import SpectralMapper
 from dejavu_torch.model import DejaVu
 from dejavu_torch.recognition.smoother import PlaceSmoother
 from dejavu_torch.teaching import in_its_light
-from dejavu_torch.types import InputError, Match
+from dejavu_torch.types import Match
 
 SUMMER, WINTER = "{data}/nordland/summer?", "{data}/nordland/winter?"
 FLOORS, CORRIDOR = "{data}/floors_rejection/query.npy", "{data}/corridor/query"
@@ -100,10 +101,8 @@ def run_drives(
         rows = list(tqdm(bench_large_drives(), "large maps", len(TASKS), disable=None, leave=False))
         write_bench(out, rows)
         return [table(rows, LARGE, "{contender}"), "places found; seconds, and memory beyond map and queries"]
-    if unknown := [name for name in routes if name not in ROUTES]:
-        raise InputError(f"{unknown[0]!r} is no route; expected one of {', '.join(map(repr, ROUTES))}")
     rows = []
-    for name in tqdm(routes or list(ROUTES), "drives", disable=None, leave=False):
+    for name in tqdm(some_of(ROUTES, routes), "drives", disable=None, leave=False):
         route, other = ROUTES[name]
         source = None if other is None else other.format(data=data)
         rows += bench_drives(name, learned(route.below(data), source), seed)
@@ -111,9 +110,9 @@ def run_drives(
     return [table(rows, COLUMNS), "AUC of one image and of the whole drive"]
 
 
-def learned(route: Route, other: str | None) -> Known:
-    """The default map of a route, calibrated if it can be, and what is asked of it."""
-    model, reference = DejaVu(), open_source(route.reference)
+def learned(route: Route, other: str | None, budget: float | None = None) -> Known:
+    """The map of a route, calibrated if it can be, and what is asked of it; `budget`: bytes per place."""
+    model, reference = DejaVu(mapper=SpectralMapper(budget)), open_source(route.reference)
     model.learn(reference)
     calibrate_if_possible(model, reference)
     query = open_source(route.query)

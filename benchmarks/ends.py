@@ -13,14 +13,13 @@ from torch import Tensor
 from tqdm import tqdm
 
 from benchmarks.cross import FOOTAGE, SHARES, WAYS, Board, described, map_beside, matches, traverses
-from benchmarks.measure import Column, Row, table, write_bench
+from benchmarks.measure import Column, Row, some_of, table, write_bench
 from dejavu_torch.data.ground_truth import GroundTruth, all_judged
 from dejavu_torch.data.traverse import Frames, Part, fitted
 from dejavu_torch.evaluation.rejection import judged
 from dejavu_torch.growth import calibrate_if_possible, merge
 from dejavu_torch.maps.spectral import SpectralMapper
 from dejavu_torch.model import DejaVu
-from dejavu_torch.types import InputError
 
 TENTH, THIRD = 0.1, 1 / 3
 HOLE = 40  # places
@@ -69,10 +68,8 @@ def run_ends(data: Path, *, out: Path, routes: Sequence[str] = ()) -> list[str]:
         out: folder for bench.json
         routes: names of routes; all if not given
     """
-    if unknown := [name for name in routes if name not in FOOTAGE]:
-        raise InputError(f"{unknown[0]!r} is no route; expected one of {', '.join(map(repr, FOOTAGE))}")
     rows: list[Row] = []
-    for name in tqdm(routes or FOOTAGE, "routes", disable=None, leave=False):
+    for name in tqdm(some_of(FOOTAGE, routes), "routes", disable=None, leave=False):
         for case in cases(name, data):
             rows.append({"case": name, "contender": case.name} | facts_of(case))
             write_bench(out, rows)

@@ -14,7 +14,7 @@ import subprocess
 import sys
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from datetime import datetime, timezone
 from functools import cache
@@ -83,6 +83,15 @@ class Store(ABC):
 def new_row(case: str, contender: str, keys: Sequence[str] = KEYS, **facts: Any) -> Row:
     """A row with all keys, of which these facts are known."""
     return {"case": case, "contender": contender} | dict.fromkeys(keys) | facts
+
+
+def some_of(known: Iterable[str], names: Sequence[str]) -> Sequence[str]:
+    """Names, or all that are known; InputError if one is not."""
+    known = [*known]
+    for name in names:
+        if name not in known:
+            raise InputError(f"{name!r} is unknown; expected one of {', '.join(map(repr, known))}")
+    return names or known
 
 
 def failure(error: Exception) -> str:

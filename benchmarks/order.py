@@ -11,7 +11,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from benchmarks.drives import ROUTES as DRIVES
-from benchmarks.measure import Row, table, truth_of, write_bench
+from benchmarks.measure import Row, some_of, table, truth_of, write_bench
 from benchmarks.results import FOOTAGE
 from benchmarks.trainings import Route, drive
 from dejavu_torch.data.source import open_source
@@ -21,7 +21,7 @@ from dejavu_torch.model import DejaVu
 from dejavu_torch.recognition.calibration import best_pair
 from dejavu_torch.recognition.centring import centred
 from dejavu_torch.recognition.select import best_candidates
-from dejavu_torch.types import InputError, Match
+from dejavu_torch.types import Match
 
 BEYOND = 20  # places elsewhere whose mean score is compared with
 WEIGHTS = (0.5, 2.0, 4.0)  # of the margin
@@ -130,9 +130,8 @@ def run_order(data: Path, *, out: Path, routes: Sequence[str] = ()) -> list[str]
         routes: names of routes; all if not given
     """
     known = CHOSEN | REPORTED
-    if unknown := [name for name in routes if name not in known]:
-        raise InputError(f"{unknown[0]!r} is no route; expected one of {', '.join(map(repr, known))}")
-    planned = [(half, name) for half, own in HALVES.items() for name in own if not routes or name in routes]
+    some = some_of(known, routes)
+    planned = [(half, name) for half, own in HALVES.items() for name in own if name in some]
     rows: list[Row] = []
     for half, name in tqdm(planned, "routes", disable=None, leave=False):
         rows += bench_order(half, name, known[name].below(data))

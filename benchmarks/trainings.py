@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 from tqdm import tqdm
 
-from benchmarks.measure import Row, done_once, truth_of, write_bench
+from benchmarks.measure import Row, done_once, some_of, truth_of, write_bench
 from benchmarks.plots import OURS, plot_areas
 from benchmarks.train import spread
 from dejavu_torch.data.source import open_source
@@ -164,12 +164,11 @@ def run_trainings(
         words = shlex.split(options)
     except ValueError as error:
         raise InputError(f"--options is {options!r} ({error}); expected words of a command line") from error
-    if unknown := [name for name in routes if name not in cases]:
-        raise InputError(f"{unknown[0]!r} is no route; expected one of {', '.join(map(repr, cases))}")
+    names = some_of(cases, routes)
     if jobs < 1 or not all(0 <= seed < 2**32 for seed in seeds):
         seen = f"bench trainings got {jobs} jobs and seeds {seeds}"
         raise InputError(f"{seen}; expected at least one, and seeds from 0 to 2^32 - 1")
-    chosen = {name: cases[name].below(data) for name in routes or cases}
+    chosen = {name: cases[name].below(data) for name in names}
     judges = {name: Judge(name, route) for name, route in chosen.items()}  # refuses missing sources
     works = [(name, seed) for name in chosen for seed in seeds]
     with ThreadPoolExecutor(jobs) as pool:

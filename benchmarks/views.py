@@ -14,7 +14,7 @@ import torch
 from tqdm import tqdm
 
 from benchmarks.cross import FOOTAGE as EVERY
-from benchmarks.measure import Column, Row, new_row, table, truth_of, write_bench
+from benchmarks.measure import Column, Row, new_row, some_of, table, truth_of, write_bench
 from dejavu_torch.data.ground_truth import GroundTruth, scored_and_right
 from dejavu_torch.data.source import open_source
 from dejavu_torch.data.traverse import Cropped, Part, chained
@@ -190,9 +190,7 @@ def run_views(
         choose: instead, steps between views and the constants of penalties
         loops: instead, loops of one drive that is both visits, one after the other
     """
-    if unknown := [name for name in routes if name not in FOOTAGE]:
-        raise InputError(f"{unknown[0]!r} is no route; expected one of {', '.join(map(repr, FOOTAGE))}")
-    some = routes or tuple(FOOTAGE)
+    some = some_of(FOOTAGE, routes)
     planned = [(name, rate, None) for rate in RATES for name in some]
     planned += [(name, "default", shift) for shift in POINTED for name in some]  # type: ignore[misc]
     rows: list[Row] = []

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import csv
+import itertools
 import json
+import math
 import warnings
 
 import numpy as np
@@ -276,6 +278,23 @@ def test_a_filter_moves_over_an_area(small_tiles, area):
     assert float(kernel[0, 1] / kernel[2, 2]) == pytest.approx(0.5 / 0.2)
 
 
+def by_heading(kernel, headings):
+    """Kernels of the moves that go each way, and the share of each heading that goes on as each."""
+    if headings == 1:
+        return [kernel], torch.ones(1, 1)
+    reach, kernels = len(kernel) // 2, []
+    change = torch.zeros(headings, headings)
+    for h in range(headings):
+        change[h, h], change[h, (h + 1) % headings], change[h, h - 1] = 0.92, 0.04, 0.04
+        share = torch.zeros_like(kernel)
+        for i, j in itertools.product(range(-reach, reach + 1), repeat=2):
+            away = math.atan2(i, j) - 2 * math.pi * h / headings
+            share[reach + i, reach + j] = math.exp(8 * (math.cos(away) - 1))
+        share[reach, reach] = 0.1434  # exp(8 (cos a - 1)) over all directions a, in the mean
+        kernels.append(kernel * share / (kernel * share).sum() * kernel.sum())
+    return kernels, change
+
+
 def test_a_filter_finds_a_flight_on_the_way(small_tiles):
     model, own, truth = flown(step=0.05)
     draw = torch.Generator().manual_seed(1)
@@ -307,10 +326,11 @@ def test_a_filter_learns_the_course_of_a_flight():
     assert 5 < float(learned.sum()) < 20  # early moves are forgotten
 
 
+@pytest.mark.parametrize("headings", [1, 8])
 @pytest.mark.parametrize(
     "area", [Layout(4, 5), Layout.of([Rectangle(3, 5), Rectangle(2, 2, corner=(-2, 3))])]
 )
-def test_a_sweep_gives_the_masses_of_the_model(small_tiles, area):
+def test_a_sweep_gives_the_masses_of_the_model(small_tiles, area, headings):
     """Against matrices of all transitions between the windows, and the state off the area."""
     queries = 5
     smoother, draw = PlaceSmoother((0.5, 0.5)), torch.Generator().manual_seed(0)
@@ -322,16 +342,26 @@ def test_a_sweep_gives_the_masses_of_the_model(small_tiles, area):
     still = torch.tensor([False, False, True, False, False])
     weight = torch.tensor([1.0, 1.0, 0.5, 0.5, 1.0])
     _, jump, leave = smoother.rate_logits.detach().softmax(0)
-    motion = PlaneMotion(area, Rates(kernel.flatten(), jump, leave, smoother.enter_logit.detach().sigmoid()))
+    rates = Rates(kernel.flatten(), jump, leave, smoother.enter_logit.detach().sigmoid())
+    motion = PlaneMotion(area, rates, headings)
     told = Evidence(values.values, 2.0, smoother.tempering)
     blocks = [*explained(FittedPart(std, weight, still, motion), told, motion, 2)][::-1]
     found = [motion.folded(torch.cat([one.posterior for one in blocks]))]
     found.append(motion.folded(torch.cat([normalised(one.before * one.after) for one in blocks])))
 
     n, cells = area.places, area.cells(torch.arange(area.places))
-    step = transitions(cells, kernel, *motion.rates[1:])
-    seen = torch.cat([told(std, weight).exp(), torch.ones(queries, 1)], 1).double()
-    belief = motion.folded(motion.anywhere()).double()
+    kernels, change = by_heading(kernel, headings)
+    each = [transitions(cells, one, *motion.rates[1:]) for one in kernels]
+    step = torch.zeros(headings * n + 1, headings * n + 1, dtype=torch.float64)
+    for h, g in itertools.product(range(headings), repeat=2):
+        goes = change[h, g] * each[g][:n, :n]  # turns, then moves
+        goes += (1 / headings - change[h, g]) * rates.jump / n  # and jumps to any heading
+        step[h * n : h * n + n, g * n : g * n + n] = goes
+        step[h * n : h * n + n, -1] += change[h, g] * each[g][:n, n]
+    step[-1, :-1], step[-1, -1] = rates.enter / (headings * n), 1 - rates.enter
+    seen = torch.cat([told(std, weight).exp()] * headings + [torch.ones(queries, 1)], 1).double()
+    on, off = motion.folded(motion.anywhere()).double().split([n, 1])
+    belief = torch.cat([on / headings] * headings + [off])
     forward, before, total = [], [], 0.0
     for t in range(queries):
         if t and not still[t]:
@@ -341,10 +371,11 @@ def test_a_sweep_gives_the_masses_of_the_model(small_tiles, area):
         total += float(belief.sum().log())
         belief = belief / belief.sum()
         forward.append(belief)
-    message = torch.ones(n + 1, dtype=torch.float64)
+    message = torch.ones(len(belief), dtype=torch.float64)
     for t in reversed(range(queries)):
         for own, masses in ((forward[t], found[0]), (before[t], found[1])):
             mass = own * message / (own * message).sum()
+            mass = torch.cat([mass[:-1].view(headings, n).sum(0), mass[-1:]])
             torch.testing.assert_close(mass.float(), masses[t], rtol=1e-3, atol=1e-5)
         message = message * seen[t]
         message = message if still[t] else step @ message

@@ -144,7 +144,10 @@ def run_lengths(same: Tensor, counts: Tensor | None = None) -> Tensor:
 
 
 def correlation_time(queries: Tensor) -> float:
-    """1 + 2 x the autocorrelations of the centred descriptors (Q,K), up to the first below .05.
+    """1 + 2 x the autocorrelations of the centred descriptors (Q,K), up to the first below .05, or larger than
+    the one before: beyond it, places that are passed again make queries alike.
+
+    Source: the initial monotone sequence of Geyer, Statistical Science 7 (1992).
 
     Example:
         >>> correlation_time(torch.tensor([[1.0], [-1], [1], [-1]]))
@@ -162,8 +165,9 @@ def correlation_time(queries: Tensor) -> float:
         return 1.0
     lags = torch.fft.irfft(power, n=2 * count)[:count] / torch.arange(count, 0, -1, device=power.device)
     lags = lags / lags[0]
-    small = (lags < chosen.SMALLEST).nonzero()
-    last = int(small[0]) if len(small) else max(1, count // 2)  # longer lags have few pairs
+    ends = (lags < chosen.SMALLEST) | (lags.diff(append=lags[-1:]) > 0).roll(1)
+    ends[max(1, count // 2)] = True  # longer lags have few pairs
+    last = int(ends.nonzero()[0])
     return 1 + 2 * float(lags[1:last].sum())
 
 

@@ -106,7 +106,10 @@ class Flight:
         presence = None if smoother.singly is None else smoother.singly.presence
         std = standardised(self.scores, self.means, presence)
         whole, mass = self.whole._replace(std=std), torch.empty_like(self.scores)
-        for block in explained(whole, self.evidence, whole.over(self.rates)):
+        states = math.isqrt(len(mass)) * self.layout.rows * self.layout.columns
+        headings = chosen.HEADINGS if chosen.HEADINGS * states <= chosen.MOST_STATES else 1
+        motion = PlaneMotion(self.layout, self.rates, headings)
+        for block in explained(whole, self.evidence, motion):
             last = block.first + len(block.log)
-            mass[block.first : last] = block.motion.folded(block.posterior)[:, :-1]
+            mass[block.first : last] = motion.folded(block.posterior)[:, :-1]
         return mass

@@ -12,6 +12,7 @@ from torch import Tensor
 from dejavu_torch.places.layout import Layout
 from dejavu_torch.places.rectangles import boxes
 from dejavu_torch.places.states import States
+from dejavu_torch.recognition import chosen
 from dejavu_torch.recognition.engine import MIN_PROBABILITY, Counts, Motion, Rates
 
 # places around one whose mass an answer is chosen by, at most, and that of a drive at least, by the
@@ -27,23 +28,28 @@ class PlaneMotion(Motion):
 
     Args:
         rates: with moves (M,), M = (2 V + 1)^2, by rows and columns, see `Followed`.
+        headings: H, evenly around, of which a camera keeps one for long; the moves of each are those that go
+            its way. States are (H,R,C), then being off the map. One is any way; `counts` is for that.
     """
 
-    def __init__(self, layout: Layout, rates: Rates) -> None:
+    def __init__(self, layout: Layout, rates: Rates, headings: int = 1) -> None:
         super().__init__(States(layout.rows * layout.columns), rates)
         self.layout, side = layout, math.isqrt(len(rates.moves))
-        self.reach, self.inside = side // 2, None
-        self.kernel = (1 - rates.jump - rates.leave) * rates.moves.view(1, 1, side, side)
+        self.chains, self.reach, self.inside = headings, side // 2, None
+        moves = (1 - rates.jump - rates.leave) * rates.moves.view(side, side)
+        self.kernel, self.change = by_heading(moves, headings)[:, None], turns(headings).to(moves)
+        self.each = self.each / headings
         if layout.inside is not None:
             self.inside = layout.inside.to(self.kernel)
-            self.each = (self.inside / self.inside.sum()).flatten()
+            self.each = (self.inside / (headings * self.inside.sum())).flatten().repeat(headings)
 
     def moved(self, belief: Tensor) -> Tensor:
         on, off = self._split(belief)
-        goes = F.conv2d(on[:, None], self.kernel.flip(2, 3), padding=self.reach)[:, 0]
+        kernel, groups = self.kernel.flip(2, 3), self.chains
+        goes = F.conv2d(self._turned(on), kernel, padding=self.reach, groups=groups)
         goes = (goes if self.inside is None else goes * self.inside).flatten(1)
-        total = on.sum((1, 2))[:, None]
-        lost = (self.kernel.sum() * total - goes.sum(1, keepdim=True)).clamp(min=0)
+        total = on.sum((1, 2, 3))[:, None]
+        lost = (self.kernel[0].sum() * total - goes.sum(1, keepdim=True)).clamp(min=0)
         anywhere = (self.rates.jump * total + self.rates.enter * off) * self.each
         off = (1 - self.rates.enter) * off + self.rates.leave * total + lost
         return torch.cat([goes + anywhere, off], 1).view_as(belief)
@@ -51,7 +57,7 @@ class PlaneMotion(Motion):
     def expected(self, message: Tensor) -> Tensor:
         on, off = self._split(message)
         _, jump, leave, enter = self.rates
-        goes = F.conv2d(self._bordered(on, off), self.kernel)[:, 0].flatten(1)
+        goes = self._turned(F.conv2d(self._bordered(on, off), self.kernel, groups=self.chains)).flatten(1)
         anywhere = (on.flatten(1) * self.each).sum(1, keepdim=True)
         back = goes + jump * anywhere + leave * off
         return torch.cat([back, enter * anywhere + (1 - enter) * off], 1).view_as(message)
@@ -62,8 +68,8 @@ class PlaneMotion(Motion):
             return super().counts(before, after)
         _, jump, leave, enter = self.rates
         around = self._bordered(later, absent).transpose(0, 1)
-        pairs = self.kernel[0] * F.conv2d(around, on[:, None], groups=len(on))[0]  # (B, 2 V + 1, 2 V + 1)
-        total, mean = on.sum((1, 2))[:, None], (later.flatten(1) * self.each).sum(1, keepdim=True)
+        pairs = self.kernel[0] * F.conv2d(around, on, groups=len(on))[0]  # (B, 2 V + 1, 2 V + 1)
+        total, mean = on.sum((1, 2, 3))[:, None], (later.flatten(1) * self.each).sum(1, keepdim=True)
         rest = [jump * total * mean, leave * total * absent, enter * off * mean, (1 - enter) * off * absent]
         each = torch.cat([pairs.flatten(1), *rest], 1)
         each = (each / each.sum(1, keepdim=True).clamp(min=MIN_PROBABILITY)).sum(0)
@@ -71,28 +77,34 @@ class PlaneMotion(Motion):
 
     def wide(self, places: Tensor, off: float | Tensor) -> Tensor:
         plane = self.layout.as_plane(places.reshape(-1, places.shape[-1])).flatten(1)
-        return super().wide(plane.view(*places.shape[:-1], -1), off)
+        plane = plane.view(*places.shape[:-1], -1)
+        return super().wide(torch.cat([plane] * self.chains, -1), off)
 
     def folded(self, mass: Tensor) -> Tensor:
         on, off = self._split(mass)
-        return torch.cat([self.layout.by_place(on), off], 1).view(*mass.shape[:-1], -1)
+        return torch.cat([self.layout.by_place(on.sum(1)), off], 1).view(*mass.shape[:-1], -1)
 
     def near(self, mass: Tensor, radius: int) -> Tensor:
         plane = self.layout.as_plane(mass.flatten(0, -2))
         return self.layout.by_place(boxes(plane, radius)).clamp(0, 1).view_as(mass)
 
     def _split(self, states: Tensor) -> tuple[Tensor, Tensor]:
-        """The plane (B,R,C), and being off it (B,1)."""
-        states = states.reshape(-1, states.shape[-1])
-        return states[:, :-1].unflatten(1, (self.layout.rows, self.layout.columns)), states[:, -1:]
+        """The plane (B,H,R,C), and being off it (B,1)."""
+        states, plane = states.reshape(-1, states.shape[-1]), (self.layout.rows, self.layout.columns)
+        return states[:, :-1].unflatten(1, (self.chains, *plane)), states[:, -1:]
+
+    def _turned(self, on: Tensor) -> Tensor:
+        """The plane (B,H,R,C), some of it at the headings beside; its own transpose."""
+        return on if self.chains == 1 else torch.einsum("bhrc,hg->bgrc", on, self.change)
 
     def _bordered(self, on: Tensor, off: Tensor) -> Tensor:
-        """Messages, with those of being off the area around them, (B, 1, R + 2 V, C + 2 V)."""
-        v, off = self.reach, off[..., None]
+        """Messages, with those of being off the area around them, (B, H, R + 2 V, C + 2 V)."""
+        v, off = self.reach, off[..., None, None]
         on = on if self.inside is None else torch.where(self.inside > 0, on, off)
-        around = off.repeat(1, on.shape[1] + 2 * v, on.shape[2] + 2 * v)
-        around[:, v : v + on.shape[1], v : v + on.shape[2]] = on
-        return around[:, None]
+        _, headings, rows, columns = on.shape
+        around = off.repeat(1, headings, rows + 2 * v, columns + 2 * v)
+        around[..., v : v + rows, v : v + columns] = on
+        return around
 
 
 class Followed(NamedTuple):
@@ -124,6 +136,26 @@ class Followed(NamedTuple):
         kernel = given[rings(len(given) - 1).to(given.device).flatten()]
         moves = MOVES_GIVEN * kernel / kernel.sum() + self.moves
         return moves / moves.sum()
+
+
+def by_heading(moves: Tensor, headings: int) -> Tensor:
+    """Moves (2 V + 1, 2 V + 1) by rows and columns, those of each heading (H, 2 V + 1, 2 V + 1), around which
+    directions have the distribution of von Mises; to stand still goes with all."""
+    if headings == 1:
+        return moves[None]
+    away = torch.arange(len(moves)).to(moves) - len(moves) // 2
+    course = torch.atan2(away[:, None], away) - 2 * math.pi / headings * torch.arange(headings)[:, None, None]
+    share = (chosen.COURSE * (course.cos() - 1)).exp()
+    share[:, away == 0, away == 0] = torch.special.i0e(torch.tensor(chosen.COURSE)).to(moves)  # the mean
+    found = moves * share
+    return found * (moves.sum() / found.sum((1, 2), keepdim=True))
+
+
+def turns(headings: int) -> Tensor:
+    """The share of each heading that goes on as each, (H,H): it is kept, or changes to one beside it."""
+    change = torch.eye(headings)
+    beside = (change.roll(1, 0) + change.roll(-1, 0)) / 2
+    return chosen.KEEPS_COURSE * change + (1 - chosen.KEEPS_COURSE) * beside
 
 
 def rings(reach: int) -> Tensor:

@@ -185,7 +185,7 @@ REFUSALS = {
     "storage A nowhere": ["nowhere", "expected"],
     "storage A B A B": ["given twice"],
     "storage A B --drives data": ["--drives", "no other option"],
-    "drives data --routes moon": ["'moon' is no route", "'city 1'"],
+    "drives data --routes moon": ["'moon' is unknown", "'city 1'"],
     "storage A B --map OF_SHORT": ["300 places", "200", "the reference"],
     "storage A B --map OF_NARROW": ["24", "9"],
     "storage A B --whitening OF_NARROW": ["a.npy gives 24", "9 features"],
