@@ -53,7 +53,8 @@ def told(*args, **more):
         (299 - Q, "backwards", ("place = 299 - query", "run backwards", "lines 0,299 and 299,0")),
         (600 - 2 * Q, "backwards", ("place = 600 - 2 query",)),
         (Q + 20 * (Q // 75), "offset", ("goes from 0 to 60", "frames are missing", "by name or time")),
-        (Q + 60 * (Q >= 150), "offset", ("goes from 0 to 60",)),
+        (Q + 60 * (Q >= 150), "offset", ("goes from 0 to 60 at query 15", "60 frames of the queries")),
+        (600 - Q - 60 * (Q >= 150), "offset", ("goes from 600 to 540", "60 frames of the queries")),
         (400 - Q - 15 * (Q // 75), "offset", ("place = - query", "goes from 400 to 355")),
     ],
 )
@@ -69,6 +70,21 @@ def test_a_relation_between_frames_is_told(places, kind, words, share):
     assert text.startswith("the answers contradict the truth (truth.csv)")
     for word in words if not share else ():
         assert word.replace("300 of", f"{300 - len(lost)} of") in text
+
+
+@pytest.mark.parametrize(("gap", "whose"), [(20, "queries"), (60, "queries"), (-60, "reference")])
+def test_an_offset_that_jumps_is_told_with_the_lines_that_mend_it(gap, whose):
+    """Answers within the gap of a reference are not sure."""
+    sure = Q[(Q < 150) | (150 - min(gap, 0) <= Q)]
+    first = int(sure[sure >= 150][0])
+    ((kind, text),) = told(sure + gap * (sure >= first), sure, sure)
+    assert kind == "offset"
+    assert (
+        f"goes from 0 to {gap} at query {first}: {abs(gap)} frames of the {whose} are missing there" in text
+    )
+    before = int(sure[sure < first][-1])
+    lines = f"0,0, {before},{before}, {first},{first + gap} and 299,{299 + gap}"
+    assert text.endswith(f"--interpolate and --truth FILE.csv with the lines {lines}")
 
 
 @given(st.floats(0.2, 4.0), st.integers(-200, 200), st.integers(0, 2**16))
@@ -181,6 +197,17 @@ def test_coordinates_that_agree_another_way(stored, own, more, kind, words):
         assert word in str(doubts[0])
 
 
+@pytest.mark.parametrize("rows", [Q + 20 * (Q // 75), Q + 60 * (Q >= 150), Q + 100 * (Q >= 100)])
+@pytest.mark.parametrize("whose", ["a.csv", "b.csv"])
+def test_coordinates_in_whose_file_rows_are_missing(rows, whose):
+    """Frames have the fixes of the rows of their numbers, by either file."""
+    stored, own = (road(torch.arange(500)), road(rows)) if whose == "b.csv" else (road(rows), PATH)
+    (doubt,) = contradictions(*grounds(stored, own))
+    assert doubt.kind == "clock"
+    assert f"if its rows are 0 to {int(rows[-1]) - 299} frames" in doubt.text
+    assert "rows are missing, or rates differ; pair by time or name" in doubt.text
+
+
 @pytest.mark.parametrize(
     "way",
     [
@@ -264,16 +291,27 @@ def test_coordinates_too_coarse_for_the_radius():
     ("above", "radius", "floors"),
     [(4.0, 5.0, True), (4.0, 3.0, False), (0.0, 5.0, False), (None, 25.0, False)],
 )
-def test_floors_within_the_radius(above, radius, floors):
-    """None: heights of a receiver, which merely vary."""
+@pytest.mark.parametrize("whose", [0, 1])
+def test_floors_within_the_radius(above, radius, floors, whose):
+    """Of one visit, which passes both. None: heights of a receiver, which merely vary."""
     draw = torch.Generator().manual_seed(0)
     height = torch.full((300,), above or 0.0) if above is not None else 4 * torch.randn(300, generator=draw)
     one = torch.cat([PATH, torch.zeros(300, 1)], 1)
-    other = torch.cat([PATH, height[:, None]], 1)
-    _, ground = grounds(one, other, radius=radius)
+    both = torch.cat([one, torch.cat([PATH, height[:, None]], 1)])
+    _, ground = grounds(*((both, one), (one, both))[whose], radius=radius)
     doubts = coarse(ground)
     assert [doubt.kind for doubt in doubts] == ["heights"] * floors
     assert not floors or ("4 m above" in str(doubts[0]) and "--truth metres:2" in str(doubts[0]))
+
+
+@pytest.mark.parametrize(("above", "radius"), [(4.0, 5.0), (4.0, 3.0), (40.0, 25.0), (2.0, 25.0)])
+def test_heights_of_two_visits_that_differ_by_a_constant_are_moved(above, radius):
+    """Not floors, as those of one visit are; a small part of the radius tells nothing."""
+    one = torch.cat([PATH, torch.zeros(300, 1)], 1)
+    judged, ground = grounds(one, one + torch.tensor([0.0, 0.0, above]), radius=radius)
+    doubts = contradictions(judged, ground) + coarse(ground)
+    assert [doubt.kind for doubt in doubts] == ["shift"] * (above > radius / 2)
+    assert all(f"moved by (0.0, 0.0, {-above}) m" in str(doubt) for doubt in doubts)
 
 
 def test_a_report_tells_it_first(tmp_path, capsys):
