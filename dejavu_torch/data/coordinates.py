@@ -137,7 +137,9 @@ def read_coordinates(path: Path, traverse: Traverse) -> tuple[Coordinates, Tenso
     values = _of_frames(table, values, traverse)
     odometer = None
     try:
-        odometer = read_odometer(table, traverse) if "moved" in table else None
+        if "moved" in table:
+            odometer = read_odometer(table, traverse)
+            seen.append("the column moved is used as an odometer, to match drives")
     except InputError as error:
         seen.append(f"the column moved is not used: {error}")
     if unused := table.unused():

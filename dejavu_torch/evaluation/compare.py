@@ -14,7 +14,6 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from dejavu_torch.data.arrays import UNNAMED
 from dejavu_torch.data.coordinates import Near
 from dejavu_torch.data.ground_truth import (
     GroundTruth,
@@ -276,9 +275,6 @@ def _prepared(
         check_loops_along(reference.layout)
     off = reporting.off_map([reference] if query is None else [reference, query])
     query = reference if query is None else query
-    if loops is None and (query is reference or (reference.name == query.name != UNNAMED)):
-        line = "%s is matched with itself, each frame with its own copy; expected a second visit"
-        log.warning(line, query.name)
     reference = model.at_map_size(reference, model.frame_shape if has_map else None)
     query = model.at_map_size(query, reference.frame_shape)
     for other in off:

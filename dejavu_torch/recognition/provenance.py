@@ -39,6 +39,7 @@ SEEN: dict[Relation, str] = {
     "between": "frames between those of the map, as of the same drive",
 }
 SO = "another visit will be found less often"
+THEMSELVES = f"the queries are {SEEN['frames']}: {SO}"
 
 
 class Spread(NamedTuple):
