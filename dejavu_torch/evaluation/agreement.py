@@ -78,7 +78,7 @@ class Ground(NamedTuple):
 
     found: (Q,K) of the answers. asked: (Q,K) of the queries. stored: (N,K) of all reference frames, own:
     (F,K) of all frames of the query's source; names: of both. second: mean seconds between the latter, None
-    if unknown.
+    if unknown. apart: how far both lie apart, in words.
     """
 
     near: Near
@@ -88,6 +88,7 @@ class Ground(NamedTuple):
     own: Tensor
     names: tuple[str, str]
     second: float | None = None
+    apart: str = ""
 
 
 def coarse(ground: Ground) -> list[Doubt]:

@@ -17,6 +17,7 @@ from torch import Tensor
 from dejavu_torch.data.coordinates import Near
 from dejavu_torch.data.ground_truth import (
     GroundTruth,
+    Nowhere,
     Truth,
     check_ground_truth,
     check_unit,
@@ -251,7 +252,10 @@ def _planned(
     # without a given truth, each place would be its own answer
     known = None
     if truth is not None or not itself:
-        known = ground_truth_of(truth, reference, query, reporting.interpolate)
+        try:
+            known = ground_truth_of(truth, reference, query, reporting.interpolate)
+        except Nowhere as error:  # the answers may tell why, see `doubts_of`
+            known = error.truth
     reporting.check_contenders(COLOURS, known is not None, len(query) * headings, len(reference))
     if known is not None and near is None and reach.within > reach.tolerance:
         known = widened(known, layout, reach.within)

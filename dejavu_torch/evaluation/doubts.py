@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from dejavu_torch.data.coordinates import Near, coordinates_of
-from dejavu_torch.data.ground_truth import Truth, check_ground_truth, scored_and_right
+from dejavu_torch.data.ground_truth import Truth, check_ground_truth, describe_distant, scored_and_right
 from dejavu_torch.evaluation.agreement import Ground, Judged, coarse, contradictions
 from dejavu_torch.evaluation.answers import describe_line
 from dejavu_torch.evaluation.localization import Localization
@@ -72,16 +72,19 @@ def ground_of(
     stored, own = coordinates_of([reference, query], near.kind)
     names, times = (reference.name, query.name), query.times
     second = None if times is None or len(times) < 2 else float(times[-1] - times[0]) / (len(times) - 1)
-    return Ground(near, stored[match.index], own[queries], stored, own, names, second)
+    apart = describe_distant(stored, own[queries], near, reference)
+    return Ground(near, stored[match.index], own[queries], stored, own, names, second, apart)
 
 
 def compared(asked: Judged, ground: Ground | None, facts: Mapping[str, Any]) -> list[Doubt]:
-    """What makes answers agree with the truth; else the line or shift of most of them that `facts` tell."""
+    """What makes answers agree with the truth; else the line or shift of most of them that `facts` tell, or
+    that coordinates make none of them right."""
     doubts = contradictions(asked, ground)
-    if not any(str(doubt).startswith(CONTRADICT) for doubt in doubts) and (
-        line := describe_line(facts, True)
-    ):
-        doubts.append(Doubt("line" if "line" in facts else "shift", line))
+    if not any(str(doubt).startswith(CONTRADICT) for doubt in doubts):
+        if line := describe_line(facts, True):
+            doubts.append(Doubt("line" if "line" in facts else "shift", line))
+        elif ground is not None and not facts["with_answer"]:
+            doubts.append(Doubt("nowhere", ground.apart))
     return doubts + ([] if ground is None else coarse(ground))
 
 

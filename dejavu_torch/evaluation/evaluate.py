@@ -18,6 +18,7 @@ from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.coordinates import Near
 from dejavu_torch.data.ground_truth import (
     GroundTruth,
+    Nowhere,
     check_ground_truth,
     check_unit,
     counted,
@@ -181,7 +182,10 @@ def evaluate_file(
     queries, match, candidates = read_matches(matches, route, resampled, higher_is_better)
     highest = int(candidates.max())
     expect(frames is None or highest < frames, f"one below {frames}", f"{matches} reports place {highest}")
-    known = find_ground_truth(truth, reference, query, frames, queries, interpolate, resampled)
+    try:
+        known = find_ground_truth(truth, reference, query, frames, queries, interpolate, resampled)
+    except Nowhere as error:  # the answers may tell why
+        known = error.truth
     if known is None:
         raise InputError("there is no ground truth; expected one, or sources with coordinates")
     carried = all(traverse is not None and traverse.places is not None for traverse in (reference, query))

@@ -15,7 +15,7 @@ from dejavu_torch import compare
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.coordinates import Near
 from dejavu_torch.evaluation.agreement import Ground, Judged, coarse, contradictions, motion_of, relation_of
-from dejavu_torch.evaluation.evaluate import ANYWHERE, evaluate_file
+from dejavu_torch.evaluation.evaluate import ANYWHERE, Asked, evaluate_file
 from dejavu_torch.evaluation.report import verdict
 from dejavu_torch.types import Coordinates, Match
 
@@ -314,14 +314,46 @@ def test_heights_of_two_visits_that_differ_by_a_constant_are_moved(above, radius
     assert all(f"moved by (0.0, 0.0, {-above}) m" in str(doubt) for doubt in doubts)
 
 
+def visits(stored, own, noise):
+    """Two with coordinates, the second with so much noise."""
+    rows, other = (torch.randn(300, 16, generator=torch.Generator().manual_seed(seed)) for seed in (0, 1))
+    rows = torch.nn.functional.normalize(rows, dim=1)
+    reference, query = ArrayTraverse(rows, "a"), ArrayTraverse(rows + noise * other, "b")
+    reference.coordinates, query.coordinates = Coordinates(stored), Coordinates(own)
+    return reference, query
+
+
+@pytest.mark.parametrize(
+    ("own", "noise", "kind", "words"),
+    [
+        ((PATH - PATH[50]) @ TURN.T + 5000, 0.15, "frame", "turned by -40.1 degrees and moved by ("),
+        (PATH + 5000, 0.15, "shift", "moved by (-5000.0, -5000.0) m"),
+        (
+            PATH + 5000,
+            9.0,
+            "nowhere",
+            "their middle is 7071 m from that of a; expected coordinates in one sys",
+        ),
+    ],
+)
+def test_coordinates_by_which_none_is_right_are_held_against_the_answers(own, noise, kind, words, tmp_path):
+    reference, query = visits(PATH, own, noise)
+    report = compare(reference, query, "metres:5", tolerance=5).report
+    (doubt,) = (doubt for doubt in report.facts["doubts"] if doubt["kind"] != "provenance")
+    assert doubt["kind"] == kind
+    assert words in doubt["text"]
+    assert report.ours.scores.auc == report.facts["with_answer"] == 0
+    assert ("which the answers contradict" in verdict(report)) == (noise < 1)
+    found = torch.arange(300) if noise < 1 else torch.randperm(300)
+    rows = "".join(f"{i},{int(found[i])},0.1\n" for i in range(300))
+    (tmp_path / "m.csv").write_text(f"query,place,score\n{rows}")
+    report = evaluate_file(tmp_path / "m.csv", "metres:5", asked=Asked(reference, query)).report
+    assert [doubt["kind"] for doubt in report.facts["doubts"]] == [kind]
+
+
 def test_a_report_tells_it_first(tmp_path, capsys):
     """On the terminal, at the top of the page, and in report.json; the verdict is not that of the map."""
-    rows = torch.nn.functional.normalize(
-        torch.randn(300, 16, generator=torch.Generator().manual_seed(0)), dim=1
-    )
-    other = 0.15 * torch.randn(300, 16, generator=torch.Generator().manual_seed(1))
-    reference, query = ArrayTraverse(rows, "a"), ArrayTraverse(rows + other, "b")
-    reference.coordinates, query.coordinates = Coordinates(PATH), Coordinates((PATH - PATH[50]) @ TURN.T)
+    reference, query = visits(PATH, (PATH - PATH[50]) @ TURN.T, 0.15)
     found = compare(reference, query, "metres:25", tolerance=5)
     (doubt,) = found.report.facts["doubts"]
     assert doubt["kind"] == "frame"
