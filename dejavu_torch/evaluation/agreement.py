@@ -195,17 +195,30 @@ def contradictions(asked: Judged, ground: Ground | None = None) -> list[Doubt]:
     return [_of_frames(relation, asked)] if better else []
 
 
-class Fit(NamedTuple):
-    """found = turn x asked + move: a similarity of the plane over complex numbers, a line over real ones.
-    near: (n,) bool, the pairs that it explains."""
+class Motion(NamedTuple):
+    """found = turn x asked + move, a similarity of the plane in complex numbers, of the mirrored asked, if
+    `mirrored`; a line, if they are real. away: (n,), how far pairs are off it."""
 
     turn: complex
     move: complex
-    near: Tensor
+    away: Tensor
+    mirrored: bool = False
+
+    def __str__(self) -> str:
+        angle, size = math.degrees(math.atan2(self.turn.imag, self.turn.real)), abs(self.turn)
+        exchanged = self.mirrored and abs(angle - 90) < TURN
+        parts = {
+            "with x and y exchanged": exchanged,
+            "mirrored (y negated)": self.mirrored and not exchanged,
+            f"turned by {angle:.1f} degrees": abs(angle) >= TURN and not exchanged,
+            f"scaled by {size:.4g}": abs(size - 1) >= STRETCH,
+            _vector(self.move.real, self.move.imag): abs(self.move) >= 0.05,
+        }
+        return " and ".join(part for part, applies in parts.items() if applies)
 
 
-def consensus(asked: Tensor, found: Tensor, within: float) -> Fit | None:
-    """The fit within some distance of which most pairs (n,) lie, by least squares of these; None if they are
+def consensus(asked: Tensor, found: Tensor, within: float) -> Motion | None:
+    """The motion within some distance of which most pairs (n,) lie, by least squares of these; None if they are
     no more than with pairs drawn at random."""
     some = _some(len(asked))
     one, other = torch.randint(len(asked), (2, PAIRS), generator=torch.Generator().manual_seed(0))
@@ -224,19 +237,16 @@ def consensus(asked: Tensor, found: Tensor, within: float) -> Fit | None:
         run = asked[near] - middle
         turn = (run.conj() * (found[near] - height)).sum() / run.abs().square().sum()
         move = height - turn * middle
-    explained = _plainly_near(_points(turn * asked + move), _points(found), within)
-    return None if explained is None else Fit(turn.item(), move.item(), explained)
+    made = turn * asked + move
+    plain = _is_plain(torch.view_as_real(made), torch.view_as_real(found), within)
+    return Motion(turn.item(), move.item(), (made - found).abs()) if plain else None
 
 
-def _plainly_near(made: Tensor, found: Tensor, within: float) -> Tensor | None:
-    """Which points (n,K) lie near those found, (n,) bool; None if no more than of pairs drawn at random."""
-    near, some = (made - found).norm(dim=1) <= within, _some(len(made))
+def _is_plain(made: Tensor, found: Tensor, within: float) -> bool:
+    """Whether more points (n,K) lie near those found than of pairs drawn at random."""
+    some, near = _some(len(made)), (made - found).norm(dim=1) <= within
     by_chance = (torch.cdist(made[some], found[some]) <= within).double().mean()
-    return near if float(near.double().mean()) > OVER_CHANCE * float(by_chance) else None
-
-
-def _points(numbers: Tensor) -> Tensor:
-    return torch.view_as_real(numbers) if numbers.is_complex() else numbers[:, None]
+    return float(near.double().mean()) > OVER_CHANCE * float(by_chance)
 
 
 def _some(count: int, most: int = SOME) -> Tensor:
@@ -252,11 +262,12 @@ def relation_of(places: Tensor, queries: Tensor, within: int) -> Relation | None
         'place = 6 query + 3'
     """
     x, y = queries.double(), places.double()
-    fit, relation, answers = consensus(x, y, within), None, 0
+    fit, relation, answers = consensus(x + 0j, y + 0j, within), None, 0
     if fit is not None:
-        slope, offset, answers = fit.turn.real, fit.move.real, int(fit.near.sum())
-        simple = float(round(slope)) if abs(slope) >= 1 else 1 / round(1 / slope)
-        level = float((y - simple * x)[fit.near].median())
+        near = fit.away <= within
+        slope, offset, answers = fit.turn.real, fit.move.real, int(near.sum())
+        simple = float(round(slope)) if abs(slope) >= 1 else 1 / round(1 / (slope or 1.0))
+        level = float((y - simple * x)[near].median())
         if (as_many := int(((y - simple * x - level).abs() <= within).sum())) >= answers - AS_WELL * len(x):
             slope, offset, answers = simple, level, as_many
         relation = Relation(slope, offset, answers, len(x))
@@ -318,35 +329,36 @@ def _of_frames(relation: Relation, asked: Judged) -> Doubt:
     return Doubt("rate", text, in_file)
 
 
-class Motion(NamedTuple):
-    """A similarity of the plane, found = turn x asked + move, as complex numbers; of the mirrored asked, if
-    `mirrored`. near: (n,) bool, the answers that it makes right."""
-
-    turn: complex
-    move: complex
-    mirrored: bool
-    near: Tensor
-
-    def __str__(self) -> str:
-        angle, size = math.degrees(math.atan2(self.turn.imag, self.turn.real)), abs(self.turn)
-        exchanged = self.mirrored and abs(angle - 90) < TURN
-        parts = {
-            "with x and y exchanged": exchanged,
-            "mirrored (y negated)": self.mirrored and not exchanged,
-            f"turned by {angle:.1f} degrees": abs(angle) >= TURN and not exchanged,
-            f"scaled by {size:.4g}": abs(size - 1) >= STRETCH,
-            _vector(self.move.real, self.move.imag): abs(self.move) >= 0.05,
-        }
-        return " and ".join(part for part, applies in parts.items() if applies)
-
-
 def motion_of(found: Tensor, asked: Tensor, radius: float, mirrored: bool = False) -> Motion | None:
     """The similarity that brings most points (n,2) of queries within a radius of those of their answers."""
     own, there = (torch.complex(*one.T) for one in (asked, found))
-    fit = consensus(own.conj().resolve_conj() if mirrored else own, there, radius)
-    if fit is None or float((there - there[fit.near].mean()).abs()[fit.near].max()) < SIZES * radius:
+    motion = consensus(own.conj().resolve_conj() if mirrored else own, there, radius)
+    if motion is None:
         return None
-    return Motion(fit.turn, fit.move, mirrored, fit.near)
+    near = there[motion.away <= radius]
+    wide = float((near - near.mean()).abs().max()) >= SIZES * radius
+    return motion._replace(mirrored=mirrored) if wide else None
+
+
+class Way(NamedTuple):
+    """What would make answers agree with coordinates, its kind and in words; the share of the answers of
+    which it tells something that it makes right, their number, and whether that explains what the truth
+    rejects: nine in ten, of many, while the truth rejects the others."""
+
+    kind: str
+    words: str
+    share: float
+    answers: int
+    holds: bool
+
+    @classmethod
+    def of(cls, kind: str, words: str, away: Tensor, right: Tensor, limit: float) -> Way:
+        """By how far answers (n,) are off by it, NaN where it tells nothing; `right` by the truth."""
+        untold, answers = away.isnan(), int((away <= limit).sum())
+        share = answers / max(1, int((~untold).sum()))
+        wrong = int((right & untold).sum()) <= REJECTED * int(untold.sum())
+        many = answers >= max(LEAST, OVERLAP * len(away))
+        return cls(kind, words, share, answers, share >= EXPLAINED and many and wrong)
 
 
 def _of_coordinates(asked: Judged, numbers: Tensor, ground: Ground, rejected: bool) -> list[Doubt]:
@@ -356,99 +368,71 @@ def _of_coordinates(asked: Judged, numbers: Tensor, ground: Ground, rejected: bo
     found, own, numbers, confident = found[known], own[known], numbers[known], len(numbers)
     if len(found) < LEAST:
         return []
-    radius, unit, left = ground.near.radius, ground.near.unit, found - own
+    radius, unit, left, name = ground.near.radius, ground.near.unit, found - own, ground.names[1]
     middle = left.median(0).values
-    away, spread = float(middle.norm()), float((left - middle).norm(dim=1).median())
-    moved = f"{_vector(*middle.tolist())} {unit}"
+    moved, off = f"{_vector(*middle.tolist())} {unit}", (left - middle).norm(dim=1)
     if not rejected:
+        away, spread = float(middle.norm()), float(off.median())
         if away <= max(SPREADS * spread, radius / 2, _step(ground.stored)):  # as between two places
             return []
         seen = f"the confident answers lie {rounded(away)} {unit} from the coordinates of their queries"
         seen = f"{seen}, in one direction, with a spread of {rounded(spread)} {unit}"
-        return [Doubt("shift", f"{seen}: they agree if those of {ground.names[1]} are {moved}")]
+        return [Doubt("shift", f"{seen}: they agree if those of {name} are {moved}")]
     queries, right = asked.queries[numbers], asked.right[numbers]
-    every = torch.ones_like(right)
-    ways: list[tuple[Explained, str, str]] = []  # with their kinds, and in words
-    if (near := _plainly_near(found - middle, own, radius)) is not None:
-        ways.append((Explained.of(near, every, right), "shift", moved))
+    exchanged = _at(ground.own, asked.match.index[numbers]) - _at(ground.stored, queries)
+    ways = [Way.of("exchanged", "with the two files exchanged", exchanged.norm(dim=1), right, radius)]
+    if _is_plain(found - middle, own, radius):
+        ways.append(Way.of("shift", moved, off, right, radius))
     found, own = found[:, :2], own[:, :2]
-    exchanged = _exchanged(asked.match.index[numbers], queries, ground)
-    ways.append((Explained.of(*exchanged, right), "exchanged", "with the two files exchanged"))
-    ways += [(some, "clock", words) for some, words in _rows(found, queries, right, ground)]
-    if not any(some.holds and some.answers >= EXPLAINED * len(found) for some, *_ in ways):
+    ways += _rows(found, queries, right, ground)
+    if not any(way.holds and way.answers >= EXPLAINED * len(found) for way in ways):
         own_frames = all(_at_origin(table) for table in (ground.stored, ground.own))
         both = ", as both begin at 0, 0" * own_frames
         motions = (motion_of(found, own, radius, mirrored) for mirrored in (False, True))
-        ways += [(Explained.of(one.near, every, right), "frame", f"{one}{both}") for one in motions if one]
-    best = max(some.share for some, *_ in ways)
-    ways = [way for way in ways if way[0].holds and way[0].share >= best - NEARLY]
+        ways += [Way.of("frame", f"{one}{both}", one.away, right, radius) for one in motions if one]
+    best = max(way.share for way in ways)
+    ways = [way for way in ways if way.holds and way.share >= best - NEARLY]
     if not ways:
         return []
     # a move or a late clock supposes less than a turn or another rate
-    ways.sort(key=lambda way: (way[1] == "frame" or "run" in way[2], -way[0].answers))
-    (first, kind, _), words = ways[0], ", or ".join(way for *_, way in ways)
-    many = f"{first.answers} of {confident} confident answers agree with the coordinates of"
-    return [
-        Doubt(kind, f"the answers contradict the truth ({asked.truth}): {many} {ground.names[1]} {words}")
-    ]
+    ways.sort(key=lambda way: (way.kind == "frame" or "run" in way.words, -way.answers))
+    many = f"{ways[0].answers} of {confident} confident answers agree with the coordinates of {name}"
+    words = ", or ".join(way.words for way in ways)
+    return [Doubt(ways[0].kind, f"the answers contradict the truth ({asked.truth}): {many} {words}")]
 
 
-class Explained(NamedTuple):
-    """The share of the answers of which a relation tells something that it makes right, their number, and
-    whether that explains what the truth rejects: nine in ten, of many, while the truth rejects the others."""
-
-    share: float
-    answers: int
-    holds: bool
-
-    @classmethod
-    def of(cls, agree: Tensor, told: Tensor, right: Tensor) -> Explained:
-        """Of answers (n,) bool that agree, those of which something is told, and those that are right."""
-        answers = int((agree & told).sum())
-        share = answers / max(1, int(told.sum()))
-        wrong = int((right & ~told).sum()) <= REJECTED * int((~told).sum())
-        many = answers >= max(LEAST, OVERLAP * len(told))
-        return cls(share, answers, share >= EXPLAINED and many and wrong)
-
-
-def _rows(found: Tensor, queries: Tensor, right: Tensor, ground: Ground) -> Iterator[tuple[Explained, str]]:
-    """How numbers of queries are related to the frames whose coordinates are those of the answers, in words,
-    and what that explains: a difference of clocks, else another relation."""
+def _rows(found: Tensor, queries: Tensor, right: Tensor, ground: Ground) -> Iterator[Way]:
+    """How numbers of queries are related to the frames whose coordinates are those of the answers: by a
+    difference of clocks, else another relation."""
     own = ground.own[:, :2]
     rows = own.isfinite().all(1).nonzero()[:, 0]
-    distance, nearest = map(
-        torch.cat, zip(*(torch.cdist(part, own[rows]).min(1) for part in found.split(256)), strict=True)
-    )
-    near, at = distance <= ground.near.radius, rows[nearest]
+    nearest = [torch.cdist(part, own[rows]).min(1) for part in found.split(256)]
+    away, at = (torch.cat(part) for part in zip(*nearest, strict=True))
+    near, at, usual = away <= ground.near.radius, rows[at], _step(own[rows]) or 1.0
     if near.sum() < LEAST:
         return
-    usual = _step(own[rows]) or 1.0
     within, limit = max(1, math.ceil(ground.near.radius / usual)), max(ground.near.radius, usual)
-
-    def away(row: Tensor, some: Tensor) -> tuple[Tensor, Tensor]:
-        """How far the coordinates of frames lie from those of the answers, and whether both are known."""
-        there = own[row.round().long().clamp(0, len(own) - 1)]
-        told = (row >= 0) & (row < len(own)) & there.isfinite().all(-1)
-        return (there - found[some]).norm(dim=-1), told
-
     some, late = _some(len(found)), (at - queries)[near].unique()
     late = late[_some(len(late))]
-    apart, told = away(queries[some] + late[:, None], some)
-    best = int(torch.where(told, apart, limit).clamp(max=limit).sum(1).argmin())
-    for relation in (
-        Relation(1.0, float(late[best]), 0, 0),
-        relation_of(at[near], queries[near], min(within, len(rows) // 10)),
-    ):
-        if relation is None:
-            return
-        apart, told = away(relation.slope * queries + relation.offset, torch.arange(len(found)))
+    apart = (_at(own, queries[some] + late[:, None]) - found[some]).norm(dim=-1)
+    best = int(apart.nan_to_num(limit).clamp(max=limit).sum(1).argmin())
+    clock = Relation(1.0, float(late[best]), 0, 0)
+    other = relation_of(at[near], queries[near], min(within, len(rows) // 10))
+    for relation in filter(None, (clock, other)):
+        off = (_at(own, relation.at(queries)) - found).norm(dim=1)
         if relation.last is not None:
-            apart, told = distance, near  # the others lie where rows are missing
-        explained = Explained.of(apart <= limit, told, right)
-        if explained.holds:
-            if relation.slope != 1 or relation.offset or relation.last is not None:
-                yield explained, _clock(relation, ground)
+            off = away.where(near, math.nan)  # the others lie where rows are missing
+        way = Way.of("clock", _clock(relation, ground), off, right, limit)
+        if way.holds:
+            if relation[:2] != (1, 0) or relation.last is not None:
+                yield way
             return
+
+
+def _at(table: Tensor, frames: Tensor) -> Tensor:
+    """The coordinates of frames, NaN beyond the ends."""
+    there = (frames >= 0) & (frames < len(table))
+    return table[frames.clamp(0, len(table) - 1)].where(there[..., None], math.nan)
 
 
 def _clock(relation: Relation, ground: Ground) -> str:
@@ -466,16 +450,6 @@ def _clock(relation: Relation, ground: Ground) -> str:
     if ground.second is None:
         return f"if its rows are {abs(relation.offset):.0f} frames {later}"
     return f"if its times are {abs(relation.offset) * ground.second:.1f} s {later}"
-
-
-def _exchanged(places: Tensor, queries: Tensor, ground: Ground) -> tuple[Tensor, Tensor]:
-    """Which answers are right if the reference has the coordinates of the query, and the reverse; and of
-    which that can be told, (n,) bool."""
-    one, other = (
-        table[at.clamp(max=len(table) - 1)] for table, at in ((ground.own, places), (ground.stored, queries))
-    )
-    told = (places < len(ground.own)) & (queries < len(ground.stored)) & (one - other).isfinite().all(1)
-    return (one - other).norm(dim=1) <= ground.near.radius, told
 
 
 def _step(path: Tensor) -> float:
