@@ -218,8 +218,8 @@ class Motion(NamedTuple):
 
 
 def consensus(asked: Tensor, found: Tensor, within: float) -> Motion | None:
-    """The motion within some distance of which most pairs (n,) lie, by least squares of these; None if they are
-    no more than with pairs drawn at random."""
+    """The motion within some distance of which most pairs (n,) lie, by least squares of these; None if they
+    are no more than with pairs drawn at random."""
     some = _some(len(asked))
     one, other = torch.randint(len(asked), (2, PAIRS), generator=torch.Generator().manual_seed(0))
     run = asked[other] - asked[one]
