@@ -5,11 +5,10 @@ from __future__ import annotations
 import logging
 import math
 import re
-from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from functools import cache
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, TypeVar
 
 import numpy as np
 import torch
@@ -20,11 +19,12 @@ from dejavu_torch.data.files import as_number
 from dejavu_torch.data.fixes import checked_fixes
 from dejavu_torch.data.folder import natural
 from dejavu_torch.data.geotiff import from_degrees
-from dejavu_torch.data.tables import Table, number, read_table, whole
+from dejavu_torch.data.tables import Table, check_frames, number, read_table, whole
 from dejavu_torch.types import Coordinates, InputError, Odometer, Traverse, expect
 
 log = logging.getLogger("dejavu_torch")
 
+Key = TypeVar("Key", str, int)
 Kind = Literal["utm", "degrees", "metres", "pixels"]
 FORMS: dict[Kind, str] = {"utm": "@easting@northing@...", "degrees": "@lat@lon@..."}
 FORMS |= {"metres": "@x@y@...", "pixels": "@x@y@..."}
@@ -36,6 +36,7 @@ EXPECTED = (
 )
 MOVED = "a csv with a column moved, in places, or moved_m, and a row for each frame, or names or times"
 PAIRS = ("x", "y"), ("lat", "lon"), ("easting", "northing")  # columns
+POSES = {12: ",,,x,,,,y,,,,z", 8: "time,x,y,z", 17: "time,x,y,z"}  # of KITTI, TUM and EuRoC, by their width
 UNITS = (1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3)  # times above are in nano-, micro- or milliseconds
 OF_MAPS = re.compile(r"EPSG:|.*\[")  # coordinate systems, by number or as text; not pixels
 COUNTED = 1e8  # whole numbers in names below count frames; times in seconds are larger
@@ -123,8 +124,8 @@ def read_coordinates(path: Path, traverse: Traverse) -> tuple[Coordinates, Tenso
     columns, degrees, height = _columns(table)
     table = table.distinct() if "time" in table and len(table) != len(traverse) else table
     turns = "heading" in table
-    columns += [table.at("heading")] if turns else []
-    table.check_width(max(columns) + 1)
+    columns += ["heading"] * turns
+    table.check_width(*columns)
     values, dimensions = np.stack([table.numbers(column) for column in columns], 1), len(columns) - turns
     if turns:
         known = ~np.isnan(values[:, -1])  # from one to the next the shorter way around
@@ -196,24 +197,19 @@ def odometer_of(traverse: Traverse) -> Odometer:
     return Odometer(torch.from_numpy(np.stack([even, np.full(len(at), math.nan)], 1)), True)
 
 
-def _columns(table: Table) -> tuple[list[int], bool, int]:
+def _columns(table: Table) -> tuple[list[str], bool, int]:
     """The columns of coordinates, whether they are degrees, and which of them is the height."""
     if not table.header:
-        width = len(table.rows[0][1])
-        if width == 12:  # KITTI: to the right, down, ahead
-            return [3, 7, 11], False, 1
-        if width in (8, 17):  # TUM, EuRoC
-            table.named("time", *"xyz")
-            return [1, 2, 3], False, 2
-        raise InputError(f"{table}; expected {EXPECTED}")
-    pair = next((pair for pair in PAIRS if all(one in table for one in pair)), None)
-    if pair is None or not table.rows:
-        raise InputError(f"{table}; expected {EXPECTED}")
+        roles = POSES.get(width := len(table.rows[0][1]), "")
+        expect(roles, EXPECTED, str(table))
+        table.named(*roles.split(","))
+        return [*"xyz"], False, 1 if width == 12 else 2  # of KITTI they point right, down, ahead
+    pair = next((pair for pair in PAIRS if all(one in table for one in pair)), ("", ""))
+    expect(all(pair) and table.rows, EXPECTED, str(table))
     degrees = pair[0] == "lat"
     # heights of receivers, of other names, are no better than tens of metres
     height = "z" in table and (pair[0] == "x" or any(column.title == "z" for column in table.header))
-    names = (*pair, "z") if height and not degrees else pair
-    return [table.at(name) for name in names], degrees, 2
+    return [*pair, *["z"] * (height and not degrees)], degrees, 2
 
 
 def _in_order(table: Table) -> list[int]:
@@ -228,23 +224,21 @@ def _in_order(table: Table) -> list[int]:
 def _of_frames(table: Table, values: np.ndarray, traverse: Traverse) -> np.ndarray:
     """The rows (R,K) of the frames of a traverse, (N,K), NaN where there is none."""
     path, frames = table.path, len(traverse)
-    none = np.full(values.shape[1], math.nan)
+
+    def picked(rows: Iterable[int | None]) -> np.ndarray:
+        none = np.full(values.shape[1], math.nan)
+        return np.array([none if row is None else values[row] for row in rows])
+
     numbered = "frame" in table and not np.isnan(table.numbers("frame")).all()  # else of another frame
     if "name" in table and (
         any(traverse.names) or not ("time" in table or numbered or len(values) == frames)
     ):
-        rows: dict[str, int] = {}
-        for row, name in enumerate(table.text("name")):
-            seen = f"{table.where(row)}: {name} is there twice"
-            fits = name not in rows or np.array_equal(values[rows[name]], values[row], equal_nan=True)
-            expect(fits, f"the row of line {table.rows[rows.get(name, row)][0]} alone", seen)
-            rows.setdefault(name, row)
+        rows = _rows_by(table, "name", table.text("name"), values)
         # names of a file may have folders, or no suffix
         for way, asked in (str, str), (_last, _last), (_last, _stem), (_stem, _stem):
             by = {way(name): row for name, row in rows.items()}
             if len(by) == len(rows) and any(asked(name) in by for name in traverse.names):
-                found = (by.get(asked(name)) for name in traverse.names)
-                return np.array([none if row is None else values[row] for row in found])
+                return picked(by.get(asked(name)) for name in traverse.names)
         seen = f"{path} tells of no frame of {traverse.name}"
         raise InputError(f"{seen}; expected its names or times, such as {[*traverse.names, 'none'][0]}")
     taken = _times(table, traverse) if "time" in table else None
@@ -255,20 +249,21 @@ def _of_frames(table: Table, values: np.ndarray, traverse: Traverse) -> np.ndarr
         return _at_times(table, times, values, traverse.name, taken)
     if numbered and not ("time" in table and len(values) == frames):
         numbers = [whole(cell, "frame", 0, table.where(row)) for row, cell in enumerate(table.text("frame"))]
-        beyond = [number for number in numbers if number >= frames]
-        from_one = (
-            "; do they count from 1?" if beyond and min(numbers) == 1 and max(numbers) == frames else ""
-        )
-        seen = f"{path} has {len(beyond)} frames beyond the last, such as {min(beyond, default=0)}{from_one}"
-        expect(not beyond, f"frames from 0 to {frames - 1} of {traverse.name}", seen)
-        twice = next((number for number, count in Counter(numbers).items() if count > 1), None)
-        expect(twice is None, "each once", f"{path} has frame {twice} twice")
-        every = np.full((frames, values.shape[1]), math.nan)
-        every[numbers] = values
-        return every
+        check_frames(numbers, frames, path, "frame")
+        return picked(map(_rows_by(table, "frame", numbers, values).get, range(frames)))
     seen = f"{path} has {len(values)} rows, {traverse.name} {frames} frames"
     expect(len(values) == frames, "as many, or a column name or time or frame", seen)
     return values
+
+
+def _rows_by(table: Table, role: str, keys: Sequence[Key], values: np.ndarray) -> dict[Key, int]:
+    """The rows of names or numbers; refuses one that is there twice, with other values."""
+    rows: dict[Key, int] = {}
+    for row, key in enumerate(keys):
+        first = rows.setdefault(key, row)
+        same, seen = np.array_equal(values[first], values[row], equal_nan=True), f"{role} {key} twice"
+        expect(same, f"the row of line {table.rows[first][0]} alone", f"{table.where(row)}: {seen}")
+    return rows
 
 
 def _last(name: str) -> str:

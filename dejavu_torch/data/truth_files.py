@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from dejavu_torch.data.files import LARGEST, as_number, read_text, reading
-from dejavu_torch.data.tables import read_table
+from dejavu_torch.data.tables import check_frames, read_table, whole
 from dejavu_torch.memory import check_room
 from dejavu_torch.types import InputError, Traverse, expect
 
@@ -35,12 +35,8 @@ def places_of_queries(
         length: of the query's source, if it is known.
     """
     first, last = min(listed), max(listed)
-    if length is not None and last >= length:
-        beyond, what = sorted(query for query in listed if query >= length), "queries beyond the last frame:"
-        what = f"{len(beyond)} {what} {beyond[0]} to" if beyond[1:] else "query"
-        from_one = "; do they count from 1?" if first == 1 and last == length else ""
-        seen = f"{path} lists {what} {last}{from_one}"
-        raise InputError(f"{seen}; expected frames from 0 to {length - 1}")
+    if length is not None:
+        check_frames(listed, length, path, "query")
     queries = numbers.tolist()
     if interpolate:
         knots = sorted(listed)
@@ -111,30 +107,21 @@ def read_csv(path: Path, frames: int | None, interpolate: bool) -> Listed:
     expect(fits, "query,place[,place...]", f"{path}, line {table.line}: columns {titles}")
     end, valid = (LARGEST, "0") if frames is None else (frames, f"0 to {frames - 1}")
     listed: Listed = {}
-    for line, cells in table.rows:
+    for row, (_, cells) in enumerate(table.rows):
+        where = table.where(row)
         while not cells[-1]:
             del cells[-1]
-        numbers = [value for value in map(as_number, cells) if value is not None]
-        query, places = (numbers or [-1.0])[0], [place for place in numbers[1:] if place != -1]
-        outside = [place for place in places if place < 0 or _rounded(place) >= end]
-        fractions = [place for place in places if place % 1 and not interpolate]
-        problem = ""
-        if len(numbers) < len(cells):
-            bad = next(cell for cell in cells if as_number(cell) is None)
-            problem = f"{bad!r} is not a frame number; expected query,place"
-        elif query < 0 or query % 1:
-            problem = f"query {cells[0]}; expected a whole number of at least 0"
-        elif query in listed:
-            problem = f"query {cells[0]} is listed twice; expected each once"
-        elif outside:
-            problem = f"place {outside[0]:.12g}; expected a reference frame from {valid}, or -1 for none"
-        elif fractions:
-            problem = f"place {fractions[0]:.12g}; expected a whole number, or interpolation"
-        elif interpolate and len(places) != 1:
-            problem = f"{len(places)} places; expected one per line to interpolate"
-        if problem:
-            raise InputError(f"{path}, line {line}: {problem}")
-        listed[int(query)] = places
+        bad = next((cell for cell in cells if as_number(cell) is None), None)
+        expect(bad is None, "query,place", f"{where}: {bad!r} is not a frame number")
+        query = whole(cells[0], "query", 0, where)
+        expect(query not in listed, "each once", f"{where}: query {query} is listed twice")
+        listed[query] = [place for place in map(float, cells[1:]) if place != -1]
+        for place in listed[query]:
+            seen, inside = f"{where}: place {place:.12g}", place >= 0 and _rounded(place) < end
+            expect(inside, f"a reference frame from {valid}, or -1 for none", seen)
+            expect(interpolate or place % 1 == 0, "a whole number, or interpolation", seen)
+        places = len(listed[query])
+        expect(not interpolate or places == 1, "one per line to interpolate", f"{where}: {places} places")
     expect(listed, "lines of query,place", f"{path} lists no query")
     return listed
 
