@@ -94,11 +94,12 @@ def coordinates_of(traverses: Sequence[Traverse], kind: Kind) -> list[Tensor]:
     expect(len(frames) < 2, "one system for both, as by gdalwarp -t_srs", seen)
     widths = [own.values.shape[1] for own in known]
     if len({*widths}) > 1:
-        _warn_flat(traverses[widths.index(2)].name, "two numbers: the heights of the other visit are")
+        flat = f"{traverses[widths.index(2)].name} has coordinates of two numbers: the other's heights"
     elif len({own.height for own in known}) > 1:
-        _warn_flat(traverses[0].name, "another axis for heights than the other visit: they are")
+        flat = f"{traverses[0].name} has coordinates of another axis for heights than the other visit: they"
     else:
         return [own.upright() for own in known]
+    _warn(f"{flat} are not compared")
     return [own.upright()[:, :2] for own in known]
 
 
@@ -148,16 +149,14 @@ def read_coordinates(path: Path, traverse: Traverse) -> tuple[Coordinates, Tenso
         seen.append(f"the column{many} {', '.join(unused)} {are} not used")
     for line in seen:
         log.warning("%s: %s", path, line)
-    headings = torch.from_numpy(values[:, -1].copy() % 360) if turns else None
-    values = values[:, :dimensions]
-    missing = int(np.isnan(values).any(1).sum()) if len(values) else len(traverse)
-    expect(missing != len(traverse), "its names or times", f"{path} tells of no frame of {traverse.name}")
-    if missing:
-        log.warning("%s: %d of %d frames have no coordinates", traverse.name, missing, len(traverse))
-    if headings is not None and (unknown := int(headings.isnan().sum())):
-        log.warning("%s: %d of %d frames have no heading", traverse.name, unknown, len(traverse))
-        headings = None if unknown == len(headings) else headings
-    return Coordinates(torch.from_numpy(values), degrees, height=height), headings, odometer
+    where, towards = np.split(values, [dimensions], 1)
+    told = not np.isnan(where).any(1).all()
+    expect(told, "its names or times", f"{path} tells of no frame of {traverse.name}")
+    for what, part in (("coordinates", where), ("heading", towards)):
+        if missing := int(np.isnan(part).any(1).sum()):
+            log.warning("%s: %d of %d frames have no %s", traverse.name, missing, len(traverse), what)
+    headings = None if np.isnan(towards).all() else torch.from_numpy(towards[:, 0] % 360)
+    return Coordinates(torch.from_numpy(where.copy()), degrees, height=height), headings, odometer
 
 
 def read_odometer(table: Table, traverse: Traverse) -> Odometer:
@@ -395,19 +394,14 @@ def _fixes(traverse: Traverse, kind: Kind) -> list[Fix]:
     if len(missing) == len(names):
         raise InputError(f"{traverse.name}: {missing[0]} has no coordinates; expected {FORMS[kind]}")
     if missing:
-        _warn_missing(traverse.name, len(missing), len(names), missing[0])
+        some = f"{len(missing)} of {len(names)} frames have no coordinates, such as {missing[0]}"
+        _warn(f"{traverse.name}: {some}, and are not scored")
     return fixes
 
 
 @cache  # a report asks twice
-def _warn_missing(source: str, missing: int, frames: int, example: str) -> None:
-    line = "%s: %d of %d frames have no coordinates, such as %s, and are not scored"
-    log.warning(line, source, missing, frames, example)
-
-
-@cache
-def _warn_flat(name: str, seen: str) -> None:
-    log.warning("%s has coordinates of %s not compared", name, seen)
+def _warn(line: str) -> None:
+    log.warning("%s", line)
 
 
 def _fix(name: str) -> Fix:

@@ -141,7 +141,7 @@ def second_look(model: DejaVu, query: Traverse, ordered: bool) -> list[Doubt]:
         if (monotonic() - began) * (count if len(asis) == 1 else 2) > SECONDS:
             return []
     del asis[0]
-    lost, told = [i for i, one in enumerate(asis) if not one.enough], list[tuple[float, Doubt]]()
+    lost = [i for i, one in enumerate(asis) if not one.enough]
     for i in lost if 2 * len(lost) >= len(asis) else ():
         best, by = asis[i], BGR
         for look in LOOKS:
@@ -153,12 +153,10 @@ def second_look(model: DejaVu, query: Traverse, ordered: bool) -> list[Doubt]:
             continue
         elsewhere = [(see(by.alter(parts[j])), asis[j]) for j in range(len(asis)) if j != i]
         worse = any(plain.enough and one <= plain for one, plain in elsewhere)
-        sure = not worse and (not ordered or any(one.enough for one, _ in elsewhere))
-        if sure or (not worse and gain >= 2 * CLEARLY[ordered]):
-            told.append((gain, by.doubt(best.found, count, asis[i].found, query.turn)))
-        if sure:
-            break
-    return [doubt for _, doubt in sorted(told, reverse=True)[:1]]
+        sure = not ordered or gain >= 2 * CLEARLY[ordered] or any(one.enough for one, _ in elsewhere)
+        if sure and not worse:
+            return [by.doubt(best.found, count, asis[i].found, query.turn)]
+    return []
 
 
 def _as_drive(model: DejaVu, frames: Tensor) -> Seen:
