@@ -15,7 +15,6 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from dejavu_torch.data.files import as_number
 from dejavu_torch.data.fixes import checked_fixes
 from dejavu_torch.data.folder import natural
 from dejavu_torch.data.geotiff import from_degrees
@@ -352,14 +351,13 @@ def named_coordinates(traverses: Sequence[Traverse], kind: Kind) -> list[Tensor]
     if kind == "utm" and looks:
         expected = "expected --truth degrees:25 (lat, lon) or metres:25"
         raise InputError(f"{one.first:g}, {one.second:g} look like degrees; {expected}")
-    if kind == "utm" and len({fix.zone for fix in known}) > 1:
-        if any(math.isnan(fix.degrees[0]) for fix in known):
-            zones = " and ".join(sorted({fix.zone[:-1] or "none" for fix in known}))
-            raise InputError(f"UTM zones {zones}; expected one, or @zone@letter@lat@lon in every name")
-        fixes = [[fix._replace(first=fix.degrees[0], second=fix.degrees[1]) for fix in own] for own in fixes]
-        kind = "degrees"
-    tables = [torch.tensor([fix[:2] for fix in own], dtype=torch.float64) for own in fixes]
-    return in_metres(tables) if kind == "degrees" else tables
+    if differ := kind == "utm" and len({fix.zone for fix in known}) > 1:
+        seen = f"UTM zones {' and '.join(sorted({fix.zone[:-1] or 'none' for fix in known}))}"
+        told = not any(math.isnan(fix.degrees[0]) for fix in known)
+        expect(told, "one, or @zone@letter@lat@lon in every name", seen)
+    rows = [[fix.degrees if differ else fix[:2] for fix in own] for own in fixes]
+    tables = [torch.tensor(own, dtype=torch.float64) for own in rows]
+    return in_metres(tables) if differ or kind == "degrees" else tables
 
 
 def in_metres(tables: Sequence[Tensor]) -> list[Tensor]:
@@ -405,17 +403,13 @@ def _warn(line: str) -> None:
 
 
 def _fix(name: str) -> Fix:
-    parts = name.split("@")[1:]
-    numbers = [value if (value := as_number(part)) is not None else math.nan for part in parts[:6]]
-    if len(numbers) < 2 or math.isnan(sum(numbers[:2])):
+    parts = [*name.split("@")[1:7], *[""] * 6]
+    first, second, zone, _, *degrees = (number(part) for part in parts[:6])
+    if math.isnan(first + second):
         return Fix(*NAN)
-    fix = Fix(numbers[0], numbers[1])
-    if len(numbers) < 4 or not (1 <= numbers[2] <= 60 and numbers[2] % 1 == 0):
-        return fix
     letter = parts[3].upper()
-    if len(letter) != 1 or not "C" <= letter <= "X":
-        return fix
-    fix = fix._replace(zone=f"{numbers[2]:g}{'N' if letter >= 'N' else 'S'}")
-    pair = numbers[4:6]
-    fits = len(pair) == 2 and abs(pair[0]) <= 90 and abs(pair[1]) <= 180
-    return fix._replace(degrees=(pair[0], pair[1])) if fits else fix
+    if not (1 <= zone <= 60 and zone % 1 == 0 and len(letter) == 1 and "C" <= letter <= "X"):
+        return Fix(first, second)
+    fits = abs(degrees[0]) <= 90 and abs(degrees[1]) <= 180
+    hemisphere = "N" if letter >= "N" else "S"
+    return Fix(first, second, f"{zone:g}{hemisphere}", (degrees[0], degrees[1]) if fits else NAN)

@@ -47,10 +47,6 @@ class Relation(NamedTuple):
     last: float | None = None
     jump: int | None = None
 
-    @property
-    def explains(self) -> bool:
-        return self.answers >= EXPLAINED * self.confident
-
     def at(self, queries: Tensor) -> Tensor:
         """The places of queries, by a slope and an offset, or two."""
         first = self.slope * queries + self.offset
@@ -60,13 +56,11 @@ class Relation(NamedTuple):
 
     def __str__(self) -> str:
         if self.last is not None:
-            sign = "query" if self.slope > 0 else "- query"
-            there = "" if self.jump is None else f" at query {self.jump}"
-            return (
-                f"place = {sign} + an offset that goes from {round(self.offset)} to {round(self.last)}{there}"
-            )
-        back, factor = self.slope < 0, "" if abs(self.slope) == 1 else f"{abs(self.slope):.4g} "
-        if back:
+            sign, there = "- " * (self.slope < 0), "" if self.jump is None else f" at query {self.jump}"
+            goes = f"goes from {round(self.offset)} to {round(self.last)}{there}"
+            return f"place = {sign}query + an offset that {goes}"
+        factor = "" if abs(self.slope) == 1 else f"{abs(self.slope):.4g} "
+        if self.slope < 0:
             return f"place = {round(self.offset)} - {factor}query"
         by = f" {'-' if self.offset < 0 else '+'} {abs(self.offset):.0f}" * (abs(self.offset) >= 0.5)
         return f"place = {factor}query{by}"
@@ -188,7 +182,7 @@ def contradictions(asked: Judged, ground: Ground | None = None) -> list[Doubt]:
         return _of_coordinates(asked, numbers, ground, rejected)
     places, queries = asked.match.index[numbers], asked.queries[numbers]
     relation = relation_of(places, queries, asked.within) if rejected else None
-    if relation is None or not relation.explains:
+    if relation is None or relation.answers < EXPLAINED * len(numbers):
         return []
     near = (places - relation.at(queries)).abs() <= asked.tolerance  # else a small tolerance rejects them
     better = relation.last is not None or int(near.sum()) >= BETTER * int(asked.right[numbers].sum())
@@ -379,10 +373,9 @@ def _of_coordinates(asked: Judged, numbers: Tensor, ground: Ground, rejected: bo
         seen = f"{seen}, in one direction, with a spread of {rounded(spread)} {unit}"
         return [Doubt("shift", f"{seen}: they agree if those of {name} are {moved}")]
     queries, right = asked.queries[numbers], asked.right[numbers]
-    exchanged = _at(ground.own, asked.match.index[numbers]) - _at(ground.stored, queries)
-    ways = [Way.of("exchanged", "with the two files exchanged", exchanged.norm(dim=1), right, radius)]
-    if _is_plain(found - middle, own, radius):
-        ways.append(Way.of("shift", moved, off, right, radius))
+    ways = [Way.of("shift", moved, off, right, radius)] * _is_plain(found - middle, own, radius)
+    exchanged = (_at(ground.own, asked.match.index[numbers]) - _at(ground.stored, queries)).norm(dim=1)
+    ways.append(Way.of("exchanged", "with the two files exchanged", exchanged, right, radius))
     found, own = found[:, :2], own[:, :2]
     ways += _rows(found, queries, right, ground)
     if not any(way.holds and way.answers >= EXPLAINED * len(found) for way in ways):
