@@ -20,7 +20,6 @@ REJECTED, EXPLAINED = 0.2, 0.9  # shares: of them that the truth rejects; that a
 SPREADS = 3.0  # of what is left, by which its mean is beyond chance
 AS_WELL = 0.02  # share of the answers by which a simpler relation may explain fewer
 PAIRS, SOME = 2000, 500  # of answers that propose a relation; answers that judge it
-NEARLY = 0.05  # by which the share that a way explains may be below that of the best, to be named
 OVERLAP = 0.4  # share of the answers that a relation has to explain, where others lack coordinates
 MISSING = 0.8, 1.25  # slopes between which frames may be missing
 CHANGES = 5  # of a value that was rounded
@@ -31,7 +30,6 @@ GROWN = 0.5  # of the queries, by which an offset may grow
 APART = 6.0  # of that way a part, within which offsets lie that change at once
 STRAY = 1.2  # of the way from its first value to its last, that such an offset may take
 TURN, STRETCH = 1.0, 0.01  # degrees, and share, below which coordinates are merely moved
-SIZES = 5.0  # radii over which answers must spread, for a motion of coordinates
 SHOWN, ABOVE, FULL = 0.1, 5.0, 0.5  # share of single images that agree with a drive; of chance; of the rest
 
 
@@ -273,8 +271,6 @@ def _growing(x: Tensor, y: Tensor, within: int) -> Relation | None:
     """An offset that only grows, or only falls, from the first query on, as where frames are missing."""
     order = x.argsort(stable=True)
     x, y = x[order], y[order]
-    if len(x) < 2 * RUN:
-        return None
     for slope in (1.0, -1.0):
         offset = y - slope * x
         runs = offset.unfold(0, RUN, 1).median(1).values
@@ -327,21 +323,16 @@ def motion_of(found: Tensor, asked: Tensor, radius: float, mirrored: bool = Fals
     """The similarity that brings most points (n,2) of queries within a radius of those of their answers."""
     own, there = (torch.complex(*one.T) for one in (asked, found))
     motion = consensus(own.conj().resolve_conj() if mirrored else own, there, radius)
-    if motion is None:
-        return None
-    near = there[motion.away <= radius]
-    wide = float((near - near.mean()).abs().max()) >= SIZES * radius
-    return motion._replace(mirrored=mirrored) if wide else None
+    return motion and motion._replace(mirrored=mirrored)
 
 
 class Way(NamedTuple):
-    """What would make answers agree with coordinates, its kind and in words; the share of the answers of
-    which it tells something that it makes right, their number, and whether that explains what the truth
-    rejects: nine in ten, of many, while the truth rejects the others."""
+    """What would make answers agree with coordinates, its kind and in words; how many it makes right, and
+    whether that explains what the truth rejects: nine in ten of those of which it tells something, of many,
+    while the truth rejects the others."""
 
     kind: str
     words: str
-    share: float
     answers: int
     holds: bool
 
@@ -349,10 +340,10 @@ class Way(NamedTuple):
     def of(cls, kind: str, words: str, away: Tensor, right: Tensor, limit: float) -> Way:
         """By how far answers (n,) are off by it, NaN where it tells nothing; `right` by the truth."""
         untold, answers = away.isnan(), int((away <= limit).sum())
-        share = answers / max(1, int((~untold).sum()))
+        most = answers >= EXPLAINED * int((~untold).sum())
         wrong = int((right & untold).sum()) <= REJECTED * int(untold.sum())
         many = answers >= max(LEAST, OVERLAP * len(away))
-        return cls(kind, words, share, answers, share >= EXPLAINED and many and wrong)
+        return cls(kind, words, answers, most and many and wrong)
 
 
 def _of_coordinates(asked: Judged, numbers: Tensor, ground: Ground, rejected: bool) -> list[Doubt]:
@@ -383,8 +374,7 @@ def _of_coordinates(asked: Judged, numbers: Tensor, ground: Ground, rejected: bo
         both = ", as both begin at 0, 0" * own_frames
         motions = (motion_of(found, own, radius, mirrored) for mirrored in (False, True))
         ways += [Way.of("frame", f"{one}{both}", one.away, right, radius) for one in motions if one]
-    best = max(way.share for way in ways)
-    ways = [way for way in ways if way.holds and way.share >= best - NEARLY]
+    ways = [way for way in ways if way.holds]
     if not ways:
         return []
     # a move or a late clock supposes less than a turn or another rate

@@ -109,6 +109,7 @@ def test_a_line_is_found_within_its_width(slope, offset, seed):
         (Q + 50 * ((Q >= 100) & (Q < 200)) + 20 * (Q >= 200), Q, {}),  # a third at a place that looks alike
         (torch.full_like(Q, 70), Q, {}),
         (torch.where(Q < 180, Q + 120, Q), Q, {}),  # most at a place that looks alike
+        (torch.where(Q < 150, Q, Q + 1000), Q, {}),  # half of it at one far ahead
         (Q + torch.randint(-2, 3, (300,), generator=torch.Generator().manual_seed(0)), Q, {"tolerance": 0}),
         (Q + 40, Q, {"sure": 0.8}),
         (Q + 40, Q, {"alone": torch.randperm(300, generator=torch.Generator().manual_seed(0))}),  # elsewhere
@@ -122,6 +123,7 @@ def test_a_line_is_found_within_its_width(slope, offset, seed):
         "alike",
         "one place",
         "most alike",
+        "half alike",
         "strict",
         "unsure",
         "single images deny",
