@@ -327,23 +327,23 @@ def motion_of(found: Tensor, asked: Tensor, radius: float, mirrored: bool = Fals
 
 
 class Way(NamedTuple):
-    """What would make answers agree with coordinates, its kind and in words; how many it makes right, and
+    """What would make answers agree with coordinates, its cause and in words; how many it makes right, and
     whether that explains what the truth rejects: nine in ten of those of which it tells something, of many,
     while the truth rejects the others."""
 
-    kind: str
+    cause: str
     words: str
     answers: int
     holds: bool
 
     @classmethod
-    def of(cls, kind: str, words: str, away: Tensor, right: Tensor, limit: float) -> Way:
+    def of(cls, cause: str, words: str, away: Tensor, right: Tensor, limit: float) -> Way:
         """By how far answers (n,) are off by it, NaN where it tells nothing; `right` by the truth."""
         untold, answers = away.isnan(), int((away <= limit).sum())
         most = answers >= EXPLAINED * int((~untold).sum())
         wrong = int((right & untold).sum()) <= REJECTED * int(untold.sum())
         many = answers >= max(LEAST, OVERLAP * len(away))
-        return cls(kind, words, answers, most and many and wrong)
+        return cls(cause, words, answers, most and many and wrong)
 
 
 def _of_coordinates(asked: Judged, numbers: Tensor, ground: Ground, rejected: bool) -> list[Doubt]:
@@ -378,10 +378,10 @@ def _of_coordinates(asked: Judged, numbers: Tensor, ground: Ground, rejected: bo
     if not ways:
         return []
     # a move or a late clock supposes less than a turn or another rate
-    ways.sort(key=lambda way: (way.kind == "frame" or "run" in way.words, -way.answers))
+    ways.sort(key=lambda way: (way.cause == "frame" or "run" in way.words, -way.answers))
     many = f"{ways[0].answers} of {confident} confident answers agree with the coordinates of {name}"
     words = ", or ".join(way.words for way in ways)
-    return [Doubt(ways[0].kind, f"the answers contradict the truth ({asked.truth}): {many} {words}")]
+    return [Doubt(ways[0].cause, f"the answers contradict the truth ({asked.truth}): {many} {words}")]
 
 
 def _rows(found: Tensor, queries: Tensor, right: Tensor, ground: Ground) -> Iterator[Way]:
