@@ -7,6 +7,7 @@ import logging
 import math
 import re
 import zipfile
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -67,14 +68,16 @@ def _to_queries(listed: Listed, frames: Tensor) -> Listed:
 def read_listed(
     path: Path, query: Traverse | None, reference: Traverse | None, frames: int | None, interpolate: bool
 ) -> Listed:
-    """As `read_csv`, up to a `stop=` of the sources; asks whether the file counts seconds if it looks so."""
+    """As `read_csv`, up to a `stop=` of the sources. Asks whether the file counts something longer than frames,
+    if it goes from 0 on without a gap, but over a small part of both visits."""
     more = 0 if reference is None else reference.beyond
     listed = read_csv(path, None if frames is None else frames + more, interpolate)
     listed = until(listed, query, reference, path)
-    if query is not None and frames is not None and look_like_seconds(listed, len(query), frames):
-        last = max(place for places in listed.values() for place in places)
+    last, counts = max(chain(*listed.values()), default=LARGEST), sorted(listed) == [*range(len(listed))]
+    ends = 0 if query is None else len(query), frames or 0
+    if counts and len(listed) >= FEW and PART * len(listed) < ends[0] and PART * last < ends[1]:
         line = "%s ends at query %d of %d and place %d of %d: does it count seconds, not frames?"
-        log.warning(line, path, max(listed), len(query), last, frames)
+        log.warning(line, path, max(listed), ends[0], last, ends[1])
     return listed
 
 
@@ -88,14 +91,6 @@ def until(listed: Listed, query: Traverse | None, reference: Traverse | None, na
     if kept and left:
         log.warning("%s: %d of its right places lie beyond a stop, of queries or of places", name, left)
     return kept or listed
-
-
-def look_like_seconds(listed: Listed, queries: int, frames: int) -> bool:
-    """Whether the numbers of a file count something longer than frames: from 0 on, without a gap, but over a
-    small part of both visits."""
-    places = [place for places in listed.values() for place in places]
-    consecutive = len(listed) >= FEW and sorted(listed) == [*range(len(listed))]
-    return consecutive and bool(places) and PART * len(listed) < queries and PART * max(places) < frames
 
 
 def read_csv(path: Path, frames: int | None, interpolate: bool) -> Listed:
