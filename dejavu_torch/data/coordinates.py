@@ -77,11 +77,9 @@ def coordinates_of(traverses: Sequence[Traverse], kind: Kind) -> list[Tensor]:
     carried = [traverse.coordinates for traverse in traverses]
     if kind not in ("metres", "pixels") or not any(carried):
         return named_coordinates(traverses, kind)
-    for own, traverse in zip(carried, traverses, strict=True):
-        if own is None:
-            other = next(one.name for one in traverses if one.coordinates is not None)
-            seen = f"{other} has coordinates and {traverse.name} none"
-            raise InputError(f"{seen}; expected 'SOURCE?coordinates=FILE' for both")
+    names = {one.coordinates is None: one.name for one in traverses}
+    seen = f"{names.get(False)} has coordinates and {names.get(True)} none"
+    expect(all(carried), "'SOURCE?coordinates=FILE' for both", seen)
     known = [own for own in carried if own is not None]
     if frame := next((own.frame for own in known if OF_MAPS.match(own.frame)), ""):
         known = [Coordinates(from_degrees(own.values, frame)) if own.degrees else own for own in known]
@@ -284,14 +282,13 @@ def _times(table: Table, traverse: Traverse) -> np.ndarray | None:
     if traverse.times is not None:
         asked: np.ndarray = traverse.times.numpy()
         return asked
-    named, times = np.array([number(_stem(name)) for name in traverse.names]), table.numbers("time")
-    known = named[~np.isnan(named)]
-    if not len(known) or known.max() >= COUNTED or (known % 1).any():
-        return named if len(known) else None
-    if np.isnan(times).all():
+    named = np.array([number(_stem(name)) for name in traverse.names])
+    known, times = (one[~np.isnan(one)] for one in (named, table.numbers("time")))
+    if not len(known):
         return None
-    within = (known >= np.nanmin(times)) & (known <= np.nanmax(times))
-    return named if within.mean() >= COVERED else None
+    within = (known >= times.min(initial=math.inf)) & (known <= times.max(initial=-math.inf))
+    counts = known.max() < COUNTED and not (known % 1).any()
+    return None if counts and within.mean() < COVERED else named
 
 
 def _range(times: np.ndarray) -> str:
@@ -310,14 +307,11 @@ def _at_times(
     asked, times = _seconds(asked), _seconds(times)
     kept = np.append(True, (np.diff(times) != 0) | (np.diff(values, axis=0) != 0).any(1))
     times, values = times[kept], values[kept]
-    equal, falls = np.flatnonzero(np.diff(times) == 0), (np.diff(times) < 0).any()
-    if falls or len(equal):
-        lines = np.array([line for line, _ in table.rows])[kept]
-        seen = f"{path} has times that do not rise; expected rows in order"
-        if not falls:
-            first = f"lines {lines[equal[0]]} and {lines[equal[0] + 1]} both have {times[equal[0]]:.17g} s"
-            seen = f"{path} has {len(equal)} times twice: {first}; expected times with more digits"
-        raise InputError(seen)
+    expect((np.diff(times) >= 0).all(), "rows in order", f"{path} has times that do not rise")
+    for row in (equal := np.flatnonzero(np.diff(times) == 0))[:1]:
+        one, other = np.array([line for line, _ in table.rows])[kept][row : row + 2]
+        seen = f"{path} has {len(equal)} times twice: lines {one} and {other} both have {times[row]:.17g} s"
+        raise InputError(f"{seen}; expected times with more digits")
     at = np.column_stack([np.interp(asked, times, column, math.nan, math.nan) for column in values.T])
     after = np.searchsorted(times, asked).clip(1, max(1, len(times) - 1))
     gap = times[after % len(times)] - times[after - 1] if len(times) > 1 else np.zeros(len(asked))

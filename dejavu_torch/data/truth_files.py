@@ -68,8 +68,8 @@ def _to_queries(listed: Listed, frames: Tensor) -> Listed:
 def read_listed(
     path: Path, query: Traverse | None, reference: Traverse | None, frames: int | None, interpolate: bool
 ) -> Listed:
-    """As `read_csv`, up to a `stop=` of the sources. Asks whether the file counts something longer than frames,
-    if it goes from 0 on without a gap, but over a small part of both visits."""
+    """As `read_csv`, up to a `stop=` of the sources. Asks whether the file counts something longer than
+    frames, if it goes from 0 on without a gap, but over a small part of both visits."""
     more = 0 if reference is None else reference.beyond
     listed = read_csv(path, None if frames is None else frames + more, interpolate)
     listed = until(listed, query, reference, path)
