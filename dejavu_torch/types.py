@@ -73,6 +73,7 @@ class Traverse(Dataset[Tensor], ABC):
         layout: where its frames lie, if they become the places of a map: along a route, or over an area.
         beyond: frames that `stop=` left out after the last.
         maker: what made ready descriptors, as their file tells; "" if it does not.
+        turn: by which its images are turned as they are read, as with `turn=90`; "" if they are not.
         cut: of windows of one long image, its size, the window's, and their range; equal: the same places.
 
     Raises:
@@ -96,6 +97,7 @@ class Traverse(Dataset[Tensor], ABC):
     sized: bool = False
     beyond: int = 0
     maker: str = ""
+    turn: str = ""
     cut: tuple[tuple[int, ...], range] | None = None
     _layout: Layout = ROUTE
 

@@ -11,15 +11,18 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from dejavu_torch.data.files import why
+from dejavu_torch.data.turning import QUARTERS, TURNS
 from dejavu_torch.data.video import FORMATS, check_same_size, pixels_of, seconds_of, stream_of
 from dejavu_torch.resize import is_stretched
 from dejavu_torch.text import printable
 from dejavu_torch.types import Facts, InputError, Traverse, expect
 
 PIPE = "-"  # standard input
+TURN = "?turn="  # after a source; what comes before it is the camera's own
 PROTOCOLS = "rtsp,rtsps,rtp,srtp,udp,tcp,tls,http,https,httpproxy,rtmp,rtmps,rtmpt,srt,crypto,data"
 OPEN_TIMEOUT = 10.0  # seconds that an address may take to answer
 
@@ -34,6 +37,7 @@ class Frame(NamedTuple):
 
 def is_stream(source: str) -> bool:
     """Whether a source is a camera, an address or a pipe, not a file or folder."""
+    source = source.partition(TURN)[0]
     named = source == PIPE or "://" in source or source.startswith("/dev/")
     return named or _mode_is(source, stat.S_ISCHR) or _mode_is(source, stat.S_ISFIFO)
 
@@ -49,7 +53,8 @@ class Camera:
     """The frames of a camera, an address or a pipe; they can be iterated once.
 
     Args:
-        source: `/dev/video0`, an address such as `rtsp://host/path`, a named pipe, or "-", standard input.
+        source: `/dev/video0`, an address such as `rtsp://host/path`, a named pipe, or "-", standard input;
+            `?turn=90` after it turns its frames, by one of `TURNS`.
         size: (height, width) in pixels to resize frames to; None keeps the camera's size.
 
     Attributes:
@@ -57,11 +62,14 @@ class Camera:
         note: a warning that `size` stretches the frames, set after the first one; else "".
 
     Raises:
-        InputError: on iterating: no camera or video, a damaged stream, a size change, or an unexpected end.
+        InputError: another turn; on iterating: no camera or video, a damaged stream, a size change, or an
+            unexpected end.
     """
 
     def __init__(self, source: str, size: tuple[int, int] | None = None) -> None:
-        self.source, self.size, self.note = source, size, ""
+        source, turns, turn = source.partition(TURN)
+        expect(not turns or turn in TURNS, f"{', '.join(TURNS)}, clockwise", f"{source}: turn={turn}")
+        self.source, self.turn, self.size, self.note = source, turn, size, ""
         self.name = "standard input" if source == PIPE else without_password(source)
         self.ends = source == PIPE or _mode_is(source, stat.S_ISFIFO)
         self.device = not self.ends and (source.startswith("/dev/") or _mode_is(source, stat.S_ISCHR))
@@ -70,16 +78,20 @@ class Camera:
     def __iter__(self) -> Iterator[Frame]:
         number = 0
         first: tuple[int, int] | None = None
-        high, wide = self.size or (0, 0)
+        exchanged = QUARTERS.get(self.turn, 0) % 180 > 0
+        high, wide = (self.size or (0, 0))[:: -1 if exchanged else 1]
         try:
             with self._open() as container:
                 stream = stream_of(container, self.name, self._expected, "SLICE")  # FRAME threads add delay
                 for frame in container.decode(stream):
                     if first is None:
                         first = (frame.height, frame.width)
-                        self.note = stretched(self.name, first, self.size)
+                        self.note = stretched(self.name, first, (high, wide) if self.size else None)
                     check_same_size(self.name, number, frame, first)
                     pixels = pixels_of(frame, Path(self.name), wide, high)
+                    if self.turn:
+                        upright = TURNS[self.turn](torch.from_numpy(pixels.copy()).movedim(-1, 0))
+                        pixels = upright.movedim(0, -1).contiguous().numpy()
                     number += 1
                     yield Frame(number - 1, seconds_of(frame.pts, stream.time_base), pixels)
         except InputError:

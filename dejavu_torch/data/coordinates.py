@@ -5,26 +5,25 @@ from __future__ import annotations
 import logging
 import math
 import re
-from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from functools import cache
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, TypeVar
 
 import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from dejavu_torch.data.files import as_number
 from dejavu_torch.data.fixes import checked_fixes
 from dejavu_torch.data.folder import natural
 from dejavu_torch.data.geotiff import from_degrees
-from dejavu_torch.data.tables import Table, number, read_table, whole
+from dejavu_torch.data.tables import Table, check_frames, number, read_table, whole
 from dejavu_torch.types import Coordinates, InputError, Odometer, Traverse, expect
 
 log = logging.getLogger("dejavu_torch")
 
+Key = TypeVar("Key", str, int)
 Kind = Literal["utm", "degrees", "metres", "pixels"]
 FORMS: dict[Kind, str] = {"utm": "@easting@northing@...", "degrees": "@lat@lon@..."}
 FORMS |= {"metres": "@x@y@...", "pixels": "@x@y@..."}
@@ -36,6 +35,7 @@ EXPECTED = (
 )
 MOVED = "a csv with a column moved, in places, or moved_m, and a row for each frame, or names or times"
 PAIRS = ("x", "y"), ("lat", "lon"), ("easting", "northing")  # columns
+POSES = {12: ",,,x,,,,y,,,,z", 8: "time,x,y,z", 17: "time,x,y,z"}  # of KITTI, TUM and EuRoC, by their width
 UNITS = (1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3)  # times above are in nano-, micro- or milliseconds
 OF_MAPS = re.compile(r"EPSG:|.*\[")  # coordinate systems, by number or as text; not pixels
 COUNTED = 1e8  # whole numbers in names below count frames; times in seconds are larger
@@ -77,11 +77,9 @@ def coordinates_of(traverses: Sequence[Traverse], kind: Kind) -> list[Tensor]:
     carried = [traverse.coordinates for traverse in traverses]
     if kind not in ("metres", "pixels") or not any(carried):
         return named_coordinates(traverses, kind)
-    for own, traverse in zip(carried, traverses, strict=True):
-        if own is None:
-            other = next(one.name for one in traverses if one.coordinates is not None)
-            seen = f"{other} has coordinates and {traverse.name} none"
-            raise InputError(f"{seen}; expected 'SOURCE?coordinates=FILE' for both")
+    names = {one.coordinates is None: one.name for one in traverses}
+    seen = f"{names.get(False)} has coordinates and {names.get(True)} none"
+    expect(all(carried), "'SOURCE?coordinates=FILE' for both", seen)
     known = [own for own in carried if own is not None]
     if frame := next((own.frame for own in known if OF_MAPS.match(own.frame)), ""):
         known = [Coordinates(from_degrees(own.values, frame)) if own.degrees else own for own in known]
@@ -93,11 +91,12 @@ def coordinates_of(traverses: Sequence[Traverse], kind: Kind) -> list[Tensor]:
     expect(len(frames) < 2, "one system for both, as by gdalwarp -t_srs", seen)
     widths = [own.values.shape[1] for own in known]
     if len({*widths}) > 1:
-        _warn_flat(traverses[widths.index(2)].name, "two numbers: the heights of the other visit are")
+        flat = f"{traverses[widths.index(2)].name} has coordinates of two numbers: the other's heights"
     elif len({own.height for own in known}) > 1:
-        _warn_flat(traverses[0].name, "another axis for heights than the other visit: they are")
+        flat = f"{traverses[0].name} has coordinates of another axis for heights than the other visit: they"
     else:
         return [own.upright() for own in known]
+    _warn(f"{flat} are not compared")
     return [own.upright()[:, :2] for own in known]
 
 
@@ -123,8 +122,8 @@ def read_coordinates(path: Path, traverse: Traverse) -> tuple[Coordinates, Tenso
     columns, degrees, height = _columns(table)
     table = table.distinct() if "time" in table and len(table) != len(traverse) else table
     turns = "heading" in table
-    columns += [table.at("heading")] if turns else []
-    table.check_width(max(columns) + 1)
+    columns += ["heading"] * turns
+    table.check_width(*columns)
     values, dimensions = np.stack([table.numbers(column) for column in columns], 1), len(columns) - turns
     if turns:
         known = ~np.isnan(values[:, -1])  # from one to the next the shorter way around
@@ -137,7 +136,9 @@ def read_coordinates(path: Path, traverse: Traverse) -> tuple[Coordinates, Tenso
     values = _of_frames(table, values, traverse)
     odometer = None
     try:
-        odometer = read_odometer(table, traverse) if "moved" in table else None
+        if "moved" in table:
+            odometer = read_odometer(table, traverse)
+            seen.append("the column moved is used as an odometer, to match drives")
     except InputError as error:
         seen.append(f"the column moved is not used: {error}")
     if unused := table.unused():
@@ -145,16 +146,14 @@ def read_coordinates(path: Path, traverse: Traverse) -> tuple[Coordinates, Tenso
         seen.append(f"the column{many} {', '.join(unused)} {are} not used")
     for line in seen:
         log.warning("%s: %s", path, line)
-    headings = torch.from_numpy(values[:, -1].copy() % 360) if turns else None
-    values = values[:, :dimensions]
-    missing = int(np.isnan(values).any(1).sum()) if len(values) else len(traverse)
-    expect(missing != len(traverse), "its names or times", f"{path} tells of no frame of {traverse.name}")
-    if missing:
-        log.warning("%s: %d of %d frames have no coordinates", traverse.name, missing, len(traverse))
-    if headings is not None and (unknown := int(headings.isnan().sum())):
-        log.warning("%s: %d of %d frames have no heading", traverse.name, unknown, len(traverse))
-        headings = None if unknown == len(headings) else headings
-    return Coordinates(torch.from_numpy(values), degrees, height=height), headings, odometer
+    where, towards = np.split(values, [dimensions], 1)
+    told = not np.isnan(where).any(1).all()
+    expect(told, "its names or times", f"{path} tells of no frame of {traverse.name}")
+    for what, part in (("coordinates", where), ("heading", towards)):
+        if missing := int(np.isnan(part).any(1).sum()):
+            log.warning("%s: %d of %d frames have no %s", traverse.name, missing, len(traverse), what)
+    headings = None if np.isnan(towards).all() else torch.from_numpy(towards[:, 0] % 360)
+    return Coordinates(torch.from_numpy(where.copy()), degrees, height=height), headings, odometer
 
 
 def read_odometer(table: Table, traverse: Traverse) -> Odometer:
@@ -194,24 +193,19 @@ def odometer_of(traverse: Traverse) -> Odometer:
     return Odometer(torch.from_numpy(np.stack([even, np.full(len(at), math.nan)], 1)), True)
 
 
-def _columns(table: Table) -> tuple[list[int], bool, int]:
+def _columns(table: Table) -> tuple[list[str], bool, int]:
     """The columns of coordinates, whether they are degrees, and which of them is the height."""
     if not table.header:
-        width = len(table.rows[0][1])
-        if width == 12:  # KITTI: to the right, down, ahead
-            return [3, 7, 11], False, 1
-        if width in (8, 17):  # TUM, EuRoC
-            table.named("time", *"xyz")
-            return [1, 2, 3], False, 2
-        raise InputError(f"{table}; expected {EXPECTED}")
-    pair = next((pair for pair in PAIRS if all(one in table for one in pair)), None)
-    if pair is None or not table.rows:
-        raise InputError(f"{table}; expected {EXPECTED}")
+        roles = POSES.get(width := len(table.rows[0][1]), "")
+        expect(roles, EXPECTED, str(table))
+        table.named(*roles.split(","))
+        return [*"xyz"], False, 1 if width == 12 else 2  # of KITTI they point right, down, ahead
+    pair = next((pair for pair in PAIRS if all(one in table for one in pair)), ("", ""))
+    expect(all(pair) and table.rows, EXPECTED, str(table))
     degrees = pair[0] == "lat"
     # heights of receivers, of other names, are no better than tens of metres
     height = "z" in table and (pair[0] == "x" or any(column.title == "z" for column in table.header))
-    names = (*pair, "z") if height and not degrees else pair
-    return [table.at(name) for name in names], degrees, 2
+    return [*pair, *["z"] * (height and not degrees)], degrees, 2
 
 
 def _in_order(table: Table) -> list[int]:
@@ -226,23 +220,21 @@ def _in_order(table: Table) -> list[int]:
 def _of_frames(table: Table, values: np.ndarray, traverse: Traverse) -> np.ndarray:
     """The rows (R,K) of the frames of a traverse, (N,K), NaN where there is none."""
     path, frames = table.path, len(traverse)
-    none = np.full(values.shape[1], math.nan)
+
+    def picked(rows: Iterable[int | None]) -> np.ndarray:
+        none = np.full(values.shape[1], math.nan)
+        return np.array([none if row is None else values[row] for row in rows])
+
     numbered = "frame" in table and not np.isnan(table.numbers("frame")).all()  # else of another frame
     if "name" in table and (
         any(traverse.names) or not ("time" in table or numbered or len(values) == frames)
     ):
-        rows: dict[str, int] = {}
-        for row, name in enumerate(table.text("name")):
-            seen = f"{table.where(row)}: {name} is there twice"
-            fits = name not in rows or np.array_equal(values[rows[name]], values[row], equal_nan=True)
-            expect(fits, f"the row of line {table.rows[rows.get(name, row)][0]} alone", seen)
-            rows.setdefault(name, row)
+        rows = _rows_by(table, "name", table.text("name"), values)
         # names of a file may have folders, or no suffix
         for way, asked in (str, str), (_last, _last), (_last, _stem), (_stem, _stem):
             by = {way(name): row for name, row in rows.items()}
             if len(by) == len(rows) and any(asked(name) in by for name in traverse.names):
-                found = (by.get(asked(name)) for name in traverse.names)
-                return np.array([none if row is None else values[row] for row in found])
+                return picked(by.get(asked(name)) for name in traverse.names)
         seen = f"{path} tells of no frame of {traverse.name}"
         raise InputError(f"{seen}; expected its names or times, such as {[*traverse.names, 'none'][0]}")
     taken = _times(table, traverse) if "time" in table else None
@@ -253,20 +245,21 @@ def _of_frames(table: Table, values: np.ndarray, traverse: Traverse) -> np.ndarr
         return _at_times(table, times, values, traverse.name, taken)
     if numbered and not ("time" in table and len(values) == frames):
         numbers = [whole(cell, "frame", 0, table.where(row)) for row, cell in enumerate(table.text("frame"))]
-        beyond = [number for number in numbers if number >= frames]
-        from_one = (
-            "; do they count from 1?" if beyond and min(numbers) == 1 and max(numbers) == frames else ""
-        )
-        seen = f"{path} has {len(beyond)} frames beyond the last, such as {min(beyond, default=0)}{from_one}"
-        expect(not beyond, f"frames from 0 to {frames - 1} of {traverse.name}", seen)
-        twice = next((number for number, count in Counter(numbers).items() if count > 1), None)
-        expect(twice is None, "each once", f"{path} has frame {twice} twice")
-        every = np.full((frames, values.shape[1]), math.nan)
-        every[numbers] = values
-        return every
+        check_frames(numbers, frames, path, "frame")
+        return picked(map(_rows_by(table, "frame", numbers, values).get, range(frames)))
     seen = f"{path} has {len(values)} rows, {traverse.name} {frames} frames"
     expect(len(values) == frames, "as many, or a column name or time or frame", seen)
     return values
+
+
+def _rows_by(table: Table, role: str, keys: Sequence[Key], values: np.ndarray) -> dict[Key, int]:
+    """The rows of names or numbers; refuses one that is there twice, with other values."""
+    rows: dict[Key, int] = {}
+    for row, key in enumerate(keys):
+        first = rows.setdefault(key, row)
+        same, seen = np.array_equal(values[first], values[row], equal_nan=True), f"{role} {key} twice"
+        expect(same, f"the row of line {table.rows[first][0]} alone", f"{table.where(row)}: {seen}")
+    return rows
 
 
 def _last(name: str) -> str:
@@ -289,14 +282,13 @@ def _times(table: Table, traverse: Traverse) -> np.ndarray | None:
     if traverse.times is not None:
         asked: np.ndarray = traverse.times.numpy()
         return asked
-    named, times = np.array([number(_stem(name)) for name in traverse.names]), table.numbers("time")
-    known = named[~np.isnan(named)]
-    if not len(known) or known.max() >= COUNTED or (known % 1).any():
-        return named if len(known) else None
-    if np.isnan(times).all():
+    named = np.array([number(_stem(name)) for name in traverse.names])
+    known, times = (one[~np.isnan(one)] for one in (named, table.numbers("time")))
+    if not len(known):
         return None
-    within = (known >= np.nanmin(times)) & (known <= np.nanmax(times))
-    return named if within.mean() >= COVERED else None
+    within = (known >= times.min(initial=math.inf)) & (known <= times.max(initial=-math.inf))
+    counts = known.max() < COUNTED and not (known % 1).any()
+    return None if counts and within.mean() < COVERED else named
 
 
 def _range(times: np.ndarray) -> str:
@@ -315,14 +307,11 @@ def _at_times(
     asked, times = _seconds(asked), _seconds(times)
     kept = np.append(True, (np.diff(times) != 0) | (np.diff(values, axis=0) != 0).any(1))
     times, values = times[kept], values[kept]
-    equal, falls = np.flatnonzero(np.diff(times) == 0), (np.diff(times) < 0).any()
-    if falls or len(equal):
-        lines = np.array([line for line, _ in table.rows])[kept]
-        seen = f"{path} has times that do not rise; expected rows in order"
-        if not falls:
-            first = f"lines {lines[equal[0]]} and {lines[equal[0] + 1]} both have {times[equal[0]]:.17g} s"
-            seen = f"{path} has {len(equal)} times twice: {first}; expected times with more digits"
-        raise InputError(seen)
+    expect((np.diff(times) >= 0).all(), "rows in order", f"{path} has times that do not rise")
+    for row in (equal := np.flatnonzero(np.diff(times) == 0))[:1]:
+        one, other = np.array([line for line, _ in table.rows])[kept][row : row + 2]
+        seen = f"{path} has {len(equal)} times twice: lines {one} and {other} both have {times[row]:.17g} s"
+        raise InputError(f"{seen}; expected times with more digits")
     at = np.column_stack([np.interp(asked, times, column, math.nan, math.nan) for column in values.T])
     after = np.searchsorted(times, asked).clip(1, max(1, len(times) - 1))
     gap = times[after % len(times)] - times[after - 1] if len(times) > 1 else np.zeros(len(asked))
@@ -356,14 +345,13 @@ def named_coordinates(traverses: Sequence[Traverse], kind: Kind) -> list[Tensor]
     if kind == "utm" and looks:
         expected = "expected --truth degrees:25 (lat, lon) or metres:25"
         raise InputError(f"{one.first:g}, {one.second:g} look like degrees; {expected}")
-    if kind == "utm" and len({fix.zone for fix in known}) > 1:
-        if any(math.isnan(fix.degrees[0]) for fix in known):
-            zones = " and ".join(sorted({fix.zone[:-1] or "none" for fix in known}))
-            raise InputError(f"UTM zones {zones}; expected one, or @zone@letter@lat@lon in every name")
-        fixes = [[fix._replace(first=fix.degrees[0], second=fix.degrees[1]) for fix in own] for own in fixes]
-        kind = "degrees"
-    tables = [torch.tensor([fix[:2] for fix in own], dtype=torch.float64) for own in fixes]
-    return in_metres(tables) if kind == "degrees" else tables
+    if differ := kind == "utm" and len({fix.zone for fix in known}) > 1:
+        seen = f"UTM zones {' and '.join(sorted({fix.zone[:-1] or 'none' for fix in known}))}"
+        told = not any(math.isnan(fix.degrees[0]) for fix in known)
+        expect(told, "one, or @zone@letter@lat@lon in every name", seen)
+    rows = [[fix.degrees if differ else fix[:2] for fix in own] for own in fixes]
+    tables = [torch.tensor(own, dtype=torch.float64) for own in rows]
+    return in_metres(tables) if differ or kind == "degrees" else tables
 
 
 def in_metres(tables: Sequence[Tensor]) -> list[Tensor]:
@@ -398,33 +386,24 @@ def _fixes(traverse: Traverse, kind: Kind) -> list[Fix]:
     if len(missing) == len(names):
         raise InputError(f"{traverse.name}: {missing[0]} has no coordinates; expected {FORMS[kind]}")
     if missing:
-        _warn_missing(traverse.name, len(missing), len(names), missing[0])
+        some = f"{len(missing)} of {len(names)} frames have no coordinates, such as {missing[0]}"
+        _warn(f"{traverse.name}: {some}, and are not scored")
     return fixes
 
 
 @cache  # a report asks twice
-def _warn_missing(source: str, missing: int, frames: int, example: str) -> None:
-    line = "%s: %d of %d frames have no coordinates, such as %s, and are not scored"
-    log.warning(line, source, missing, frames, example)
-
-
-@cache
-def _warn_flat(name: str, seen: str) -> None:
-    log.warning("%s has coordinates of %s not compared", name, seen)
+def _warn(line: str) -> None:
+    log.warning("%s", line)
 
 
 def _fix(name: str) -> Fix:
-    parts = name.split("@")[1:]
-    numbers = [value if (value := as_number(part)) is not None else math.nan for part in parts[:6]]
-    if len(numbers) < 2 or math.isnan(sum(numbers[:2])):
+    parts = [*name.split("@")[1:7], *[""] * 6]
+    first, second, zone, _, *degrees = (number(part) for part in parts[:6])
+    if math.isnan(first + second):
         return Fix(*NAN)
-    fix = Fix(numbers[0], numbers[1])
-    if len(numbers) < 4 or not (1 <= numbers[2] <= 60 and numbers[2] % 1 == 0):
-        return fix
     letter = parts[3].upper()
-    if len(letter) != 1 or not "C" <= letter <= "X":
-        return fix
-    fix = fix._replace(zone=f"{numbers[2]:g}{'N' if letter >= 'N' else 'S'}")
-    pair = numbers[4:6]
-    fits = len(pair) == 2 and abs(pair[0]) <= 90 and abs(pair[1]) <= 180
-    return fix._replace(degrees=(pair[0], pair[1])) if fits else fix
+    if not (1 <= zone <= 60 and zone % 1 == 0 and len(letter) == 1 and "C" <= letter <= "X"):
+        return Fix(first, second)
+    fits = abs(degrees[0]) <= 90 and abs(degrees[1]) <= 180
+    hemisphere = "N" if letter >= "N" else "S"
+    return Fix(first, second, f"{zone:g}{hemisphere}", (degrees[0], degrees[1]) if fits else NAN)

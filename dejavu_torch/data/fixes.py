@@ -22,6 +22,7 @@ PER_DEGREE = 111_200.0  # metres, of a meridian
 
 
 Fixes = npt.NDArray[np.float64]
+Mask = npt.NDArray[np.bool_]
 
 
 def checked_fixes(values: Fixes, degrees: bool = False, lines: Sequence[int] = ()) -> tuple[Fixes, list[str]]:
@@ -52,94 +53,95 @@ def checked_fixes(values: Fixes, degrees: bool = False, lines: Sequence[int] = (
         values[known, 1] = np.unwrap(values[known, 1], period=360)
     for none in (0.0, -1.0):
         at = (values[:, :2] == none).all(1)
-        if 2 <= at.sum() < len(values) - 1 and _far(values, at, degrees):
+        if 2 <= at.sum() < len(values) - 1 and _far(metres(values, degrees), at):
             values[at] = math.nan
             seen.append(f"{at.sum()} fixes at {none:g}, {none:g} lie far from the next one")
-    if (off := _astray(values, degrees)).any():
-        away, first = rounded(float(_steps(values, degrees).max())), lines[np.flatnonzero(off)[0]]
+    path = metres(values, degrees)
+    if (off := _astray(path)).any():
+        away, first = rounded(float(_steps(path).max())), lines[np.flatnonzero(off)[0]]
         values[off] = math.nan
-        fixes = (
+        many = (
             f"{off.sum()} fixes from line {first} on lie"
             if off.sum() > 1
             else f"the fix in line {first} lies"
         )
-        seen.append(f"{fixes} {away} m off the path")
-    values = _held(values, degrees, seen, lines)
-    if 0 < len(jumps := _jumps(values, degrees)) <= JOINED:
-        row, *again = np.flatnonzero(~np.isnan(values).any(1))[jumps]
-        away = rounded(float(_steps(values, degrees)[jumps[0]]))
+        seen.append(f"{many} {away} m off the path")
+    values = _held(values, metres(values, degrees), seen, lines)
+    path = metres(values, degrees)
+    if 0 < len(jumps := _jumps(path)) <= JOINED:
+        row, *again = np.flatnonzero(_known(values))[jumps]
         then = f"again after line {lines[again[0]]}" if again else "does not come back"
+        away = rounded(float(_steps(path)[jumps[0]]))
         seen.append(f"the path jumps {away} m after line {lines[row]}, and {then}")
     return values, seen
 
 
 def metres(values: Fixes, degrees: bool) -> Fixes:
     """Coordinates (R,K) in metres, near enough to compare steps."""
-    if not degrees:
-        return values
-    across = np.cos(np.radians(np.nanmean(values[:, 0]))) if len(values) else 1.0
-    found: Fixes = PER_DEGREE * values[:, :2] * [1.0, across]
+    across = np.cos(np.radians(np.nanmean(values[:, 0]))) if degrees and len(values) else 1.0
+    found: Fixes = PER_DEGREE * values[:, :2] * [1.0, across] if degrees else values.copy()
     return found
 
 
-def _steps(values: Fixes, degrees: bool) -> Fixes:
-    """The length in metres of the steps between fixes that are known, one after the other."""
-    known = values[~np.isnan(values).any(1)]
-    lengths: Fixes = np.linalg.norm(np.diff(metres(known, degrees), axis=0), axis=1)
+def _known(path: Fixes) -> Mask:
+    known: Mask = np.all(~np.isnan(path), axis=1)
+    return known
+
+
+def _steps(path: Fixes) -> Fixes:
+    """The length of the steps between fixes that are known, one after the other."""
+    lengths: Fixes = np.linalg.norm(np.diff(path[_known(path)], axis=0), axis=1)
     return lengths
 
 
-def _usual(values: Fixes, degrees: bool) -> float:
+def _usual(path: Fixes) -> float:
     """The usual length of a step that is one; 0 if there is none."""
-    steps = _steps(values, degrees)
+    steps = _steps(path)
     return float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.0
 
 
-def _far(values: Fixes, at: npt.NDArray[np.bool_], degrees: bool) -> bool:
+def _limit(path: Fixes) -> float:
+    """The length of a step that is no vehicle's."""
+    return max(AWAY, FAR * _usual(path))
+
+
+def _far(path: Fixes, at: Mask) -> bool:
     """Whether the fixes of a mask lie far from all others that follow them, or from those before."""
-    others = ~at & ~np.isnan(values).any(1)
-    if not others.any():
-        return False
-    limit = max(AWAY, FAR * _usual(values[others], degrees))
-    none, *path = metres(np.concatenate([values[at][:1], values[others]]), degrees)
+    others = ~at & _known(path)
     order = np.searchsorted(np.flatnonzero(others), np.flatnonzero(at))
-    next_to = np.unique(np.minimum(order, len(path) - 1))
-    return bool((np.linalg.norm(np.array(path)[next_to] - none, axis=1) > limit).all())
+    beside = path[others][np.minimum(order, others.sum() - 1)] if others.any() else path[:0]
+    away = np.linalg.norm(beside - path[at][0], axis=1)
+    return bool(len(away) and (away > _limit(path[others])).all())
 
 
-def _jumps(values: Fixes, degrees: bool) -> list[int]:
+def _jumps(path: Fixes) -> list[int]:
     """The fixes that are known, by their order, after which comes a step that is no vehicle's; none if there
     are many."""
-    steps, apart = _steps(values, degrees), np.diff(np.flatnonzero(~np.isnan(values).any(1)))
-    jumps = np.flatnonzero(steps > apart * max(AWAY, FAR * _usual(values, degrees))).tolist()
+    steps, apart = _steps(path), np.diff(np.flatnonzero(_known(path)))
+    jumps = np.flatnonzero(steps > apart * _limit(path)).tolist()
     return jumps if len(steps) >= 2 * LEAST and len(jumps) <= max(2, RARE * len(steps)) else []
 
 
-def _astray(values: Fixes, degrees: bool) -> npt.NDArray[np.bool_]:
+def _astray(path: Fixes) -> Mask:
     """Which fixes lie far off a path that goes on after them, (R,) bool: between two steps that are no
     vehicle's, in few rows."""
-    off = np.zeros(len(values), dtype=bool)
-    jumps = _jumps(values, degrees)
-    if not jumps:
+    off, rows = np.zeros(len(path), dtype=bool), np.flatnonzero(_known(path))
+    if not (jumps := _jumps(path)):
         return off
-    rows = np.flatnonzero(~np.isnan(values).any(1))
-    at, usual = metres(values[rows], degrees), _usual(values, degrees)
-    limit = max(AWAY, FAR * usual)
+    at, last, alone = path[rows], len(rows) - 1, len(jumps) == 1
     # a jump before the first fix, and one after the last, as if the path went on there
-    ends = [-1] * (jumps[0] < LEAST), [len(rows) - 1] * (jumps[-1] >= len(rows) - 1 - LEAST)
-    jumps, alone = [*ends[0], *jumps, *ends[1]], len(jumps) == 1
+    jumps = [*[-1] * (jumps[0] < LEAST), *jumps, *[last] * (jumps[-1] >= last - LEAST)]
     for i, before in enumerate(jumps):
         for after in jumps[i + 1 :]:
             if off[rows[max(before, 0)]] or after - before > MOST:
                 break
-            if before < 0 or after == len(rows) - 1:
-                goes_on = alone
-            else:
-                away = np.linalg.norm(at[after + 1] - at[before])
-                goes_on = bool(away <= limit + MADE_UP * usual * (after - before))
+            goes_on = alone
+            if before >= 0 and after < last:
+                away = float(np.linalg.norm(at[after + 1] - at[before]))
+                goes_on = away <= _limit(path) + MADE_UP * _usual(path) * (after - before)
             off[rows[before + 1 : after + 1]] |= goes_on
     if off.any():  # what is left may have an end that is off
-        off |= _astray(np.where(off[:, None], math.nan, values), degrees)
+        off |= _astray(np.where(off[:, None], math.nan, path))
     return off
 
 
@@ -151,9 +153,9 @@ def _straight(path: Fixes) -> bool:
     return bool(np.median((steps[1:] * steps[:-1]).sum(1) / (lengths[1:] * lengths[:-1])) > AHEAD)
 
 
-def _held(values: Fixes, degrees: bool, seen: list[str], lines: Sequence[int]) -> Fixes:
-    """Values without fixes that are held; see `checked_fixes`."""
-    known = np.flatnonzero(~np.isnan(values).any(1))
+def _held(values: Fixes, path: Fixes, seen: list[str], lines: Sequence[int]) -> Fixes:
+    """Values, in metres a `path`, without fixes that are held; see `checked_fixes`."""
+    known, values = np.flatnonzero(_known(values)), values.copy()
     if len(known) < 2:
         return values
     own = values[known]
@@ -161,24 +163,21 @@ def _held(values: Fixes, degrees: bool, seen: list[str], lines: Sequence[int]) -
     lengths = np.diff(np.append(starts, len(own)))
     every = float(np.median(lengths[:-1])) if len(lengths) > 1 else 0.0
     near = np.abs(lengths[1:-1] - every) <= max(1.0, every / 4)
-    at = metres(own[starts], degrees)
+    at = path[known][starts]
     if 2 <= every <= SLOWEST and len(lengths) > LEAST and near.mean() >= ALIKE and _straight(at):
         stays = starts[1:][lengths[:-1] > 2 * every] - round(every)  # until then it stood
         knots, between = np.sort(np.append(starts, stays)), known[: starts[-1] + 1]
         for column in own.T:
             column[: len(between)] = np.interp(between, known[knots], column[knots])
-        values = values.copy()
         values[known] = own
         seen.append(f"fixes change every {every:g} lines; those between are interpolated")
         return values
-    usual, held = _usual(values, degrees), np.zeros(len(values), dtype=bool)
     after = np.append(np.linalg.norm(np.diff(at, axis=0), axis=1), 0.0)
-    for start, length, step in zip(starts, lengths, after, strict=True):
-        if length >= HELD and step > max(MADE_UP, length / MADE_UP) * usual:
-            held[known[start + 1 : start + length]] = True
+    made_up = after > np.maximum(MADE_UP, lengths / MADE_UP) * _usual(path)
+    held = np.repeat(made_up & (lengths >= HELD), lengths)
+    held[starts] = False
     if held.any():
-        values = values.copy()
-        values[held] = math.nan
-        fixes = f"{held.sum()} fixes from line {lines[np.flatnonzero(held)[0]]} on"
+        values[known[held]] = math.nan
+        fixes = f"{held.sum()} fixes from line {lines[known[held][0]]} on"
         seen.append(f"{fixes} repeat the one before, though the next one makes up for them")
     return values

@@ -56,6 +56,14 @@ class GroundTruth(NamedTuple):
     ignored: Tensor
 
 
+class Nowhere(InputError):
+    """No query has a right place by its coordinates. truth: which has none, for those who ask why."""
+
+    def __init__(self, message: str, truth: GroundTruth) -> None:
+        super().__init__(message)
+        self.truth = truth
+
+
 Truth: TypeAlias = str | Path | Tensor | np.ndarray | Sequence[int] | Sequence[Sequence[int]] | GroundTruth
 
 
@@ -350,7 +358,7 @@ def find_ground_truth(
         ground_truth = ground_truth._replace(judged=~asked.isnan().any(1))
         known = stored.isfinite().all(1).any() and ground_truth.judged.any()
         if known and not (ground_truth.positives >= 0).any():
-            _refuse_distant(stored, asked, parsed, reference)
+            raise Nowhere(describe_distant(stored, asked, parsed, reference), ground_truth)
     elif parsed.suffix.lower() == ".npz":
         hard, *soft = read_matrices(parsed, numbers, frames, all_frames)
         ground_truth = all_judged(padded(row.nonzero()[:, 0] for row in hard))
@@ -376,14 +384,14 @@ def find_ground_truth(
     raise InputError(f"no query has a right answer with truth {parsed}; expected {expected}")
 
 
-def _refuse_distant(stored: Tensor, asked: Tensor, near: Near, reference: Traverse) -> None:
-    """Tell how far coordinates (N,K) and (Q,K) lie apart, none of which are near each other."""
+def describe_distant(stored: Tensor, asked: Tensor, near: Near, reference: Traverse) -> str:
+    """How far coordinates (N,K) and (Q,K) lie apart, none of which are near each other, in words."""
     one, other = (table[~table.isnan().any(1)].median(0).values for table in (stored, asked))
     frame = "" if reference.coordinates is None else reference.coordinates.frame
     words, apart = describe_ground_truth(f"{near.kind}:{near.radius:g}"), float((one - other).norm())
     seen = f"no query has a right answer {words}: their middle is {rounded(apart)} {near.unit} from"
     wanted = f"coordinates in {frame}, or lat,lon" if OF_MAPS.match(frame) else "coordinates in one system"
-    raise InputError(f"{seen} that of {reference.name}; expected {wanted}, or a larger distance")
+    return f"{seen} that of {reference.name}; expected {wanted}, or a larger distance"
 
 
 def _warn_of_many(truth: GroundTruth, frames: int | None) -> None:

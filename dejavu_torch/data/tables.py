@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -48,6 +49,7 @@ class Column(NamedTuple):
     unit: float | None = None
 
 
+@dataclass
 class Table:
     """Rows of cells with the names of their columns.
 
@@ -56,15 +58,11 @@ class Table:
         line: number of that of the header. used: numbers of the columns that are asked for, or need not be.
     """
 
-    def __init__(
-        self,
-        path: Path,
-        header: Sequence[Column],
-        rows: list[tuple[int, list[str]]],
-        line: int = 1,
-        used: Iterable[int] = (),
-    ) -> None:
-        self.path, self.header, self.rows, self.line, self.used = path, [*header], rows, line, {*used}
+    path: Path
+    header: list[Column]
+    rows: list[tuple[int, list[str]]]
+    line: int = 1
+    used: set[int] = field(default_factory=set)
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -79,7 +77,7 @@ class Table:
     def distinct(self) -> Table:
         """Without rows that repeat the cells of the one before, as of messages that were written twice."""
         rows = [row for i, row in enumerate(self.rows) if not i or row[1] != self.rows[i - 1][1]]
-        return Table(self.path, self.header, rows, self.line, self.used)
+        return replace(self, rows=rows)
 
     def where(self, row: int) -> str:
         """The line of a row, for messages."""
@@ -91,19 +89,19 @@ class Table:
         self.used.add(column)
         return column
 
-    def text(self, role: str | int) -> list[str]:
+    def text(self, role: str) -> list[str]:
         """The cells of a column, "" where a row is too short."""
-        column = self.at(role) if isinstance(role, str) else role
+        column = self.at(role)
         return [cells[column] if column < len(cells) else "" for _, cells in self.rows]
 
-    def numbers(self, role: str | int) -> np.ndarray:
+    def numbers(self, role: str) -> np.ndarray:
         """The numbers of a column in its unit, (R,) float64; NaN for cells that are none."""
-        column = self.at(role) if isinstance(role, str) else role
-        unit = self.header[column].unit if self.header else None
-        return np.array([number(cell) for cell in self.text(column)]) * (1.0 if unit is None else unit)
+        unit = self.header[self.at(role)].unit
+        return np.array([number(cell) for cell in self.text(role)]) * (1.0 if unit is None else unit)
 
-    def check_width(self, width: int) -> None:
-        """Refuse rows of fewer cells."""
+    def check_width(self, *roles: str) -> None:
+        """Refuse rows that lack cells of these columns."""
+        width = 1 + max(map(self.at, roles))
         for row, (_, cells) in enumerate(self.rows):
             expect(len(cells) >= width, f"{width} or more", f"{self.where(row)}: {len(cells)} columns")
 
@@ -154,7 +152,7 @@ def read_table(path: Path, expected: str) -> Table:
         if column.role in taken or not plain:
             columns[i] = Column(column.title, column.title, column.unit)
         taken.add(columns[i].role)
-    return Table(path, columns, rows, at, range(len(columns)) if known else ())
+    return Table(path, columns, rows, at, {*range(len(columns))} if known else set())
 
 
 def column_of(title: str) -> Column:
@@ -170,6 +168,16 @@ def column_of(title: str) -> Column:
             base, unit = found[1].strip("_ "), UNITS[found[2]]
     base = base if base in NAMED else re.split("[./]", base)[-1]  # as in pose.position.x
     return Column(title, NAMED.get(base, title), unit)
+
+
+def check_frames(numbers: Collection[int], length: int, path: Path, what: str) -> None:
+    """Refuse numbers of frames beyond the last, and ask whether they count from 1 if it looks so."""
+    beyond = sorted(number for number in numbers if number >= length)
+    if beyond:
+        seen = f"{path} has {len(beyond)} beyond the last frame: {what} {beyond[0]}"
+        seen += f" to {beyond[-1]}" * (len(beyond) > 1)
+        from_one = "; do they count from 1?" * (min(numbers) == 1 and max(numbers) == length)
+        raise InputError(f"{seen}{from_one}; expected frames from 0 to {length - 1}")
 
 
 def number(text: str) -> float:

@@ -38,7 +38,8 @@ class Part(Traverse):
 
     def __init__(self, traverse: Traverse, frame: Tensor | range) -> None:
         self.traverse, self.frame, self.name = traverse, frame, traverse.name
-        self.sized, self.ordered, self.maker = traverse.sized, traverse.ordered, traverse.maker
+        self.sized, self.ordered = traverse.sized, traverse.ordered
+        self.maker, self.turn = traverse.maker, traverse.turn
         if isinstance(frame, range):
             self.beyond = len(range(frame.start, len(traverse) + traverse.beyond, frame.step)) - len(frame)
         self.times, self.places, self.headings = (

@@ -7,6 +7,7 @@ import logging
 import math
 import re
 import zipfile
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ import torch
 from torch import Tensor
 
 from dejavu_torch.data.files import LARGEST, as_number, read_text, reading
-from dejavu_torch.data.tables import read_table
+from dejavu_torch.data.tables import check_frames, read_table, whole
 from dejavu_torch.memory import check_room
 from dejavu_torch.types import InputError, Traverse, expect
 
@@ -35,12 +36,8 @@ def places_of_queries(
         length: of the query's source, if it is known.
     """
     first, last = min(listed), max(listed)
-    if length is not None and last >= length:
-        beyond, what = sorted(query for query in listed if query >= length), "queries beyond the last frame:"
-        what = f"{len(beyond)} {what} {beyond[0]} to" if beyond[1:] else "query"
-        from_one = "; do they count from 1?" if first == 1 and last == length else ""
-        seen = f"{path} lists {what} {last}{from_one}"
-        raise InputError(f"{seen}; expected frames from 0 to {length - 1}")
+    if length is not None:
+        check_frames(listed, length, path, "query")
     queries = numbers.tolist()
     if interpolate:
         knots = sorted(listed)
@@ -71,14 +68,16 @@ def _to_queries(listed: Listed, frames: Tensor) -> Listed:
 def read_listed(
     path: Path, query: Traverse | None, reference: Traverse | None, frames: int | None, interpolate: bool
 ) -> Listed:
-    """As `read_csv`, up to a `stop=` of the sources; asks whether the file counts seconds if it looks so."""
+    """As `read_csv`, up to a `stop=` of the sources. Asks whether the file counts something longer than
+    frames, if it goes from 0 on without a gap, but over a small part of both visits."""
     more = 0 if reference is None else reference.beyond
     listed = read_csv(path, None if frames is None else frames + more, interpolate)
     listed = until(listed, query, reference, path)
-    if query is not None and frames is not None and look_like_seconds(listed, len(query), frames):
-        last = max(place for places in listed.values() for place in places)
+    last, counts = max(chain(*listed.values()), default=LARGEST), sorted(listed) == [*range(len(listed))]
+    ends = 0 if query is None else len(query), frames or 0
+    if counts and len(listed) >= FEW and PART * len(listed) < ends[0] and PART * last < ends[1]:
         line = "%s ends at query %d of %d and place %d of %d: does it count seconds, not frames?"
-        log.warning(line, path, max(listed), len(query), last, frames)
+        log.warning(line, path, max(listed), ends[0], last, ends[1])
     return listed
 
 
@@ -94,14 +93,6 @@ def until(listed: Listed, query: Traverse | None, reference: Traverse | None, na
     return kept or listed
 
 
-def look_like_seconds(listed: Listed, queries: int, frames: int) -> bool:
-    """Whether the numbers of a file count something longer than frames: from 0 on, without a gap, but over a
-    small part of both visits."""
-    places = [place for places in listed.values() for place in places]
-    consecutive = len(listed) >= FEW and sorted(listed) == [*range(len(listed))]
-    return consecutive and bool(places) and PART * len(listed) < queries and PART * max(places) < frames
-
-
 def read_csv(path: Path, frames: int | None, interpolate: bool) -> Listed:
     """The places of lines of query,place[,place...]."""
     table = read_table(path, "lines of query,place")
@@ -111,30 +102,21 @@ def read_csv(path: Path, frames: int | None, interpolate: bool) -> Listed:
     expect(fits, "query,place[,place...]", f"{path}, line {table.line}: columns {titles}")
     end, valid = (LARGEST, "0") if frames is None else (frames, f"0 to {frames - 1}")
     listed: Listed = {}
-    for line, cells in table.rows:
+    for row, (_, cells) in enumerate(table.rows):
+        where = table.where(row)
         while not cells[-1]:
             del cells[-1]
-        numbers = [value for value in map(as_number, cells) if value is not None]
-        query, places = (numbers or [-1.0])[0], [place for place in numbers[1:] if place != -1]
-        outside = [place for place in places if place < 0 or _rounded(place) >= end]
-        fractions = [place for place in places if place % 1 and not interpolate]
-        problem = ""
-        if len(numbers) < len(cells):
-            bad = next(cell for cell in cells if as_number(cell) is None)
-            problem = f"{bad!r} is not a frame number; expected query,place"
-        elif query < 0 or query % 1:
-            problem = f"query {cells[0]}; expected a whole number of at least 0"
-        elif query in listed:
-            problem = f"query {cells[0]} is listed twice; expected each once"
-        elif outside:
-            problem = f"place {outside[0]:.12g}; expected a reference frame from {valid}, or -1 for none"
-        elif fractions:
-            problem = f"place {fractions[0]:.12g}; expected a whole number, or interpolation"
-        elif interpolate and len(places) != 1:
-            problem = f"{len(places)} places; expected one per line to interpolate"
-        if problem:
-            raise InputError(f"{path}, line {line}: {problem}")
-        listed[int(query)] = places
+        bad = next((cell for cell in cells if as_number(cell) is None), None)
+        expect(bad is None, "query,place", f"{where}: {bad!r} is not a frame number")
+        query = whole(cells[0], "query", 0, where)
+        expect(query not in listed, "each once", f"{where}: query {query} is listed twice")
+        listed[query] = [place for place in map(float, cells[1:]) if place != -1]
+        for place in listed[query]:
+            seen, inside = f"{where}: place {place:.12g}", place >= 0 and _rounded(place) < end
+            expect(inside, f"a reference frame from {valid}, or -1 for none", seen)
+            expect(interpolate or place % 1 == 0, "a whole number, or interpolation", seen)
+        places = len(listed[query])
+        expect(not interpolate or places == 1, "one per line to interpolate", f"{where}: {places} places")
     expect(listed, "lines of query,place", f"{path} lists no query")
     return listed
 

@@ -27,6 +27,21 @@ TURNS: Mapping[str, Callable[[Tensor], Tensor]] = {
 QUARTERS = {"90": 90, "180": 180, "270": 270, "mirror": 0, "transpose": 90}
 
 
+def composed(*turns: str) -> str | None:
+    """The one of `TURNS` that does what several do, one after the other; "" if they undo each other, None if
+    there is none.
+
+    Example:
+        >>> composed("90", "180"), composed("90", "270"), composed("mirror", "180")
+        ('270', '', None)
+    """
+    turned = picture = torch.arange(6).view(2, 3)
+    for turn in filter(None, turns):
+        turned = TURNS[turn](turned)
+    same = {"": picture, **{name: alter(picture) for name, alter in TURNS.items()}}
+    return next((name for name, other in same.items() if torch.equal(other, turned)), None)
+
+
 class Upright(Part):
     """Frames turned by one of `TURNS`, for a camera that is mounted otherwise, or mirrored.
 

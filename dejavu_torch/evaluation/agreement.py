@@ -20,44 +20,45 @@ REJECTED, EXPLAINED = 0.2, 0.9  # shares: of them that the truth rejects; that a
 SPREADS = 3.0  # of what is left, by which its mean is beyond chance
 AS_WELL = 0.02  # share of the answers by which a simpler relation may explain fewer
 PAIRS, SOME = 2000, 500  # of answers that propose a relation; answers that judge it
-STEEPEST, SIMPLE = 30.0, 12  # places a query; whole slopes that are tried
-NEARLY = 0.05  # by which the share that a way explains may be below that of the best, to be named
 OVERLAP = 0.4  # share of the answers that a relation has to explain, where others lack coordinates
+MISSING = 0.8, 1.25  # slopes between which frames may be missing
 CHANGES = 5  # of a value that was rounded
 FLOOR, FEW = 2.0, 1500  # metres that a floor is above another, at least; places that are looked at
 BETTER = 3  # times as many answers as the truth that a relation makes right within the tolerance
 RUN = 15  # consecutive answers whose median tells an offset that changes
 GROWN = 0.5  # of the queries, by which an offset may grow
+APART = 6.0  # of that way a part, within which offsets lie that change at once
 STRAY = 1.2  # of the way from its first value to its last, that such an offset may take
 TURN, STRETCH = 1.0, 0.01  # degrees, and share, below which coordinates are merely moved
-SIZES = 5.0  # radii over which answers must spread, for a motion of coordinates
 SHOWN, ABOVE, FULL = 0.1, 5.0, 0.5  # share of single images that agree with a drive; of chance; of the rest
 
 
 class Relation(NamedTuple):
     """place = slope x query + offset, within some frames of which `answers` of `confident` answers lie; or
-    offsets that grow from the first to the `last`, at a slope of one, either way."""
+    offsets that grow from the first to the `last`, at a slope of one, either way: all at once if at a `jump`,
+    the first query with the last."""
 
     slope: float
     offset: float
     answers: int
     confident: int
     last: float | None = None
-
-    @property
-    def explains(self) -> bool:
-        return self.answers >= EXPLAINED * self.confident
+    jump: int | None = None
 
     def at(self, queries: Tensor) -> Tensor:
-        """The places of queries, by a slope and an offset."""
-        return (self.slope * queries + self.offset).round().long()
+        """The places of queries, by a slope and an offset, or two."""
+        first = self.slope * queries + self.offset
+        if self.jump is not None and self.last is not None:
+            first += (queries >= self.jump) * (self.last - self.offset)
+        return first.round().long()
 
     def __str__(self) -> str:
         if self.last is not None:
-            sign = "query" if self.slope > 0 else "- query"
-            return f"place = {sign} + an offset that goes from {round(self.offset)} to {round(self.last)}"
-        back, factor = self.slope < 0, "" if abs(self.slope) == 1 else f"{abs(self.slope):.4g} "
-        if back:
+            sign, there = "- " * (self.slope < 0), "" if self.jump is None else f" at query {self.jump}"
+            goes = f"goes from {round(self.offset)} to {round(self.last)}{there}"
+            return f"place = {sign}query + an offset that {goes}"
+        factor = "" if abs(self.slope) == 1 else f"{abs(self.slope):.4g} "
+        if self.slope < 0:
             return f"place = {round(self.offset)} - {factor}query"
         by = f" {'-' if self.offset < 0 else '+'} {abs(self.offset):.0f}" * (abs(self.offset) >= 0.5)
         return f"place = {factor}query{by}"
@@ -69,7 +70,7 @@ class Ground(NamedTuple):
 
     found: (Q,K) of the answers. asked: (Q,K) of the queries. stored: (N,K) of all reference frames, own:
     (F,K) of all frames of the query's source; names: of both. second: mean seconds between the latter, None
-    if unknown.
+    if unknown. apart: how far both lie apart, in words.
     """
 
     near: Near
@@ -79,10 +80,12 @@ class Ground(NamedTuple):
     own: Tensor
     names: tuple[str, str]
     second: float | None = None
+    apart: str = ""
 
 
 def coarse(ground: Ground) -> list[Doubt]:
-    """Coordinates that cannot tell what a radius asks for: with few digits, or of floors within it."""
+    """Coordinates that cannot tell what a radius asks for: with few digits, or of floors within it, of one
+    visit, as two differ where their heights count from elsewhere."""
     radius, unit, doubts = ground.near.radius, ground.near.unit, list[Doubt]()
     for name, table in dict(zip(ground.names, (ground.stored, ground.own), strict=True)).items():
         known = table[table.isfinite().all(1), :2]
@@ -90,8 +93,7 @@ def coarse(ground: Ground) -> list[Doubt]:
             if (size := _rounded_to(known, axis)) > radius / 2:
                 seen = f"the {title} of {name} are multiples of {rounded(size)} {unit}"
                 doubts.append(Doubt("digits", f"{seen}, too coarse for a distance of {radius:g} {unit}"))
-    floors = _floors(torch.cat([ground.stored, ground.own]), radius)
-    if floors:
+    if floors := max(_floors(table, radius) for table in (ground.stored, ground.own)):
         seen = f"places lie {rounded(floors)} {unit} above others, all within {radius:g} {unit} of a query"
         expected = f"--truth {ground.near.kind}:{floors / 2:.2g}"
         doubts.append(Doubt("heights", f"{seen}: a smaller distance tells floors apart", expected))
@@ -120,7 +122,7 @@ def _floors(places: Tensor, radius: float) -> float:
     places = places[places.isfinite().all(1)]
     if places.shape[1] < 3 or len(places) < LEAST:
         return 0.0
-    some = places[torch.linspace(0, len(places) - 1, min(FEW, len(places))).round().long()]
+    some = places[_some(len(places), FEW)]
     near = torch.cdist(some[:, :2], some[:, :2]) <= min(radius / 5, FLOOR)
     above = (some[:, None, 2] - some[None, :, 2]).abs()[near]
     higher = above[above >= FLOOR]
@@ -178,112 +180,21 @@ def contradictions(asked: Judged, ground: Ground | None = None) -> list[Doubt]:
         return _of_coordinates(asked, numbers, ground, rejected)
     places, queries = asked.match.index[numbers], asked.queries[numbers]
     relation = relation_of(places, queries, asked.within) if rejected else None
-    if relation is None or not relation.explains:
+    if relation is None or relation.answers < EXPLAINED * len(numbers):
         return []
     near = (places - relation.at(queries)).abs() <= asked.tolerance  # else a small tolerance rejects them
     better = relation.last is not None or int(near.sum()) >= BETTER * int(asked.right[numbers].sum())
     return [_of_frames(relation, asked)] if better else []
 
 
-def relation_of(places: Tensor, queries: Tensor, within: int) -> Relation | None:
-    """The relation near which most answers lie; None if they are no more than with pairs drawn at random.
-
-    Example:
-        >>> queries = torch.arange(60)
-        >>> str(relation_of(6 * queries + 3, queries, within=5))
-        'place = 6 query + 3'
-    """
-    x, y = queries.double(), places.double()
-    some = torch.linspace(0, len(x) - 1, min(SOME, len(x))).round().long()
-    draw = torch.Generator().manual_seed(0)
-    one, other = torch.randint(len(x), (2, PAIRS), generator=draw)
-    run = x[other] - x[one]
-    slope = (y[other] - y[one]) / run
-    kept = (run.abs() >= (x.max() - x.min()) / 5) & (run != 0) & (slope.abs() <= STEEPEST) & (slope != 0)
-    if not kept.any():
-        return None
-    offset = (y[one] - slope * x[one])[kept]
-
-    def near(slope: Tensor | float, offset: Tensor | float) -> Tensor:
-        return (y - slope * x - offset).abs() <= within
-
-    counts = ((y[some] - slope[kept][:, None] * x[some] - offset[:, None]).abs() <= within).sum(1)
-    best = int(counts.argmax())
-    at, start = float(slope[kept][best]), float(offset[best])
-    for _ in range(3):  # least squares of what lies near it
-        own = near(at, start)
-        if own.sum() < 2 or len(x[own].unique()) < 2:
-            break
-        middle, height = x[own].mean(), y[own].mean()
-        at = float(((x[own] - middle) * (y[own] - height)).sum() / (x[own] - middle).square().sum())
-        start = float(height - at * middle)
-    answers = int(near(at, start).sum())
-    simple = [sign * k for k in range(1, SIMPLE + 1) for sign in (1.0, -1.0)]
-    for straight in sorted([*simple, *(1 / one for one in simple[2:])], key=lambda one: abs(one - at))[:1]:
-        level = float((y - straight * x)[near(at, start)].median()) if answers else start
-        if (as_many := int(near(straight, level).sum())) >= answers - AS_WELL * len(x):
-            at, start, answers = straight, level, as_many
-    by_chance = (
-        float(((y[None, some] - at * x[some, None] - start).abs() <= within).sum()) / len(some) / len(some)
-    )
-    found = Relation(at, start, answers, len(x))
-    plain = found if answers > OVER_CHANCE * by_chance * len(x) else None
-    growing = _growing(x, y, within)
-    return growing if growing and growing.answers > answers + AS_WELL * len(x) else plain
-
-
-def _growing(x: Tensor, y: Tensor, within: int) -> Relation | None:
-    """An offset that only grows, or only falls, from the first query on, as where frames are missing."""
-    order = x.argsort(stable=True)
-    x, y = x[order], y[order]
-    if len(x) < 2 * RUN:
-        return None
-    most = GROWN * float(x[-1] - x[0])
-    for slope in (1.0, -1.0):
-        offset = y - slope * x
-        runs = offset.unfold(0, RUN, 1).median(1).values
-        steps = runs[:: RUN // 2].diff().abs().sum()
-        middle = torch.cat([runs[:1].expand(RUN // 2), runs, runs[-1:].expand(len(x) - len(runs) - RUN // 2)])
-        near = int(((offset - middle).abs() <= within).sum())
-        way = float((runs[-1] - runs[0]).abs())
-        if float((x + slope * middle).diff().min()) < -within:  # back to places that were passed
-            continue
-        if near >= EXPLAINED * len(x) and float(steps) <= STRAY * way + within and within < way <= most:
-            return Relation(slope, float(runs[0]), near, len(x), float(runs[-1]))
-    return None
-
-
-def _of_frames(relation: Relation, asked: Judged) -> Doubt:
-    """A relation between numbers of frames in words, with what would make the truth agree."""
-    many = f"{relation.answers} of {relation.confident} confident answers"
-    text = f"the answers contradict the truth ({asked.truth}): {many} follow {relation}"
-    at = relation.at(asked.queries)
-    there = asked.queries[(at >= 0) & (at < (asked.places or at.max() + 1))]
-    first, last = int(there.min()), int(there.max())
-    ends = [f"{query},{int(relation.at(there.new_tensor(query)))}" for query in (first, last)]
-    in_file = f"--interpolate and --truth FILE.csv with the lines {ends[0]} and {ends[1]}"
-    if relation.last is not None:
-        what = "frames are missing, or their rates differ; pair frames by name or time in a --truth FILE.csv"
-        return Doubt("offset", f"{text}: {what}")
-    if relation.slope == 1.0:
-        return Doubt("offset", text, f"--truth {round(relation.offset)}")
-    if relation.slope < 0:
-        return Doubt("backwards", f"{text}: the queries run backwards", in_file)
-    if 0.8 < relation.slope < 1.25:
-        grown = [relation.offset + (relation.slope - 1) * query for query in (first, last)]
-        text += f", so the offset goes from {round(grown[0])} to {round(grown[1])}"
-        text += ": frames are missing, or rates differ"
-    return Doubt("rate", text, in_file)
-
-
 class Motion(NamedTuple):
-    """A similarity of the plane, found = turn x asked + move, as complex numbers; of the mirrored asked, if
-    `mirrored`. near: (n,) bool, the answers that it makes right."""
+    """found = turn x asked + move, a similarity of the plane in complex numbers, of the mirrored asked, if
+    `mirrored`; a line, if they are real. away: (n,), how far pairs are off it."""
 
     turn: complex
     move: complex
-    mirrored: bool
-    near: Tensor
+    away: Tensor
+    mirrored: bool = False
 
     def __str__(self) -> str:
         angle, size = math.degrees(math.atan2(self.turn.imag, self.turn.real)), abs(self.turn)
@@ -298,165 +209,230 @@ class Motion(NamedTuple):
         return " and ".join(part for part, applies in parts.items() if applies)
 
 
-def motion_of(found: Tensor, asked: Tensor, radius: float, mirrored: bool = False) -> Motion | None:
-    """The similarity that brings most points (n,2) of queries within a radius of those of their answers."""
-    a, f = (torch.complex(one[:, 0], one[:, 1]) for one in (asked, found))
-    a = a.conj() if mirrored else a
-    some = torch.linspace(0, len(a) - 1, min(SOME, len(a))).round().long()
-    draw = torch.Generator().manual_seed(0)
-    one, other = torch.randint(len(a), (2, PAIRS), generator=draw)
-    run = a[other] - a[one]
-    kept = run.abs() > max(2 * radius, float(run.abs().median()) / 2)
+def consensus(asked: Tensor, found: Tensor, within: float) -> Motion | None:
+    """The motion within some distance of which most pairs (n,) lie, by least squares of these; None if they
+    are no more than with pairs drawn at random."""
+    some = _some(len(asked))
+    one, other = torch.randint(len(asked), (2, PAIRS), generator=torch.Generator().manual_seed(0))
+    run = asked[other] - asked[one]
+    kept = run.abs() > run.abs().median() / 2
     if not kept.any():
         return None
-    turn = ((f[other] - f[one])[kept] / run[kept]).resolve_conj()
-    move = f[one][kept] - turn * a[one][kept]
-    counts = ((turn[:, None] * a[some] + move[:, None] - f[some]).abs() <= radius).sum(1)
-    best = int(counts.argmax())
-    c, t = turn[best], move[best]
+    turns = (found[other] - found[one])[kept] / run[kept]
+    moves = found[one][kept] - turns * asked[one][kept]
+    away = (turns[:, None] * asked[some] + moves[:, None] - found[some]).abs()
+    best = int((away <= within).sum(1).argmax())
+    turn, move = turns[best], moves[best]
     for _ in range(3):
-        near = (c * a + t - f).abs() <= radius
-        if near.sum() < 2:
-            return None
-        middle, height = a[near].mean(), f[near].mean()
-        c = ((a[near] - middle).conj() * (f[near] - height)).sum() / (a[near] - middle).abs().square().sum()
-        t = height - c * middle
-    near = (c * a + t - f).abs() <= radius
-    by_chance = float(((c * a[some, None] + t - f[None, some]).abs() <= radius).double().mean())
-    spread = float((f[near] - f[near].mean()).abs().max()) if near.any() else 0.0
-    plain = float(near.double().mean()) >= OVER_CHANCE * by_chance and spread >= SIZES * radius
-    return Motion(complex(c), complex(t), mirrored, near) if plain else None
+        near = (turn * asked + move - found).abs() <= within
+        middle, height = asked[near].mean(), found[near].mean()
+        run = asked[near] - middle
+        turn = (run.conj() * (found[near] - height)).sum() / run.abs().square().sum()
+        move = height - turn * middle
+    made = turn * asked + move
+    plain = _is_plain(torch.view_as_real(made), torch.view_as_real(found), within)
+    return Motion(turn.item(), move.item(), (made - found).abs()) if plain else None
 
 
-def _of_coordinates(asked: Judged, numbers: Tensor, ground: Ground, rejected: bool) -> list[Doubt]:
-    """What makes answers and coordinates agree, in words."""
-    radius, unit = ground.near.radius, ground.near.unit
-    found, own = ground.found[numbers, :2], ground.asked[numbers, :2]
-    known = (found.isfinite() & own.isfinite()).all(1)
-    found, own, queries = found[known], own[known], asked.queries[numbers][known]
-    if len(found) < LEAST:
-        return []
-    left = found - own
-    middle = left.median(0).values
-    away, spread = float(middle.norm()), float((left - middle).norm(dim=1).median())
-    moved = f"{_vector(*middle.tolist())} {unit}"
-    if not rejected:
-        if away > max(SPREADS * spread, radius / 2, _step(ground.stored)):  # of answers between two places
-            seen = f"the confident answers lie {rounded(away)} {unit} from the coordinates of their queries"
-            seen = f"{seen}, in one direction, with a spread of {rounded(spread)} {unit}"
-            return [Doubt("shift", f"{seen}: they agree if those of {ground.names[1]} are {moved}")]
-        return []
-    ways: list[tuple[Explained, str, str]] = []  # with their kinds, and in words
-    near, right = (left - middle).norm(dim=1) <= radius, asked.right[numbers][known]
-    every = torch.ones_like(near)
-    some = torch.linspace(0, len(found) - 1, min(SOME, len(found))).round().long()
-    by_chance = (torch.cdist(found[some] - middle, own[some]) <= radius).double().mean()
-    if float(near.double().mean()) >= OVER_CHANCE * float(by_chance):
-        ways.append((Explained.of(near, every, right), "shift", moved))
-    exchanged = _exchanged(asked.match.index[numbers][known], queries, ground)
-    ways.append((Explained.of(*exchanged, right), "exchanged", "with the two files exchanged"))
-    ways += [(some, "clock", words) for some, words in _rows(found, queries, right, ground)]
-    if not any(some.holds and some.answers >= EXPLAINED * len(found) for some, *_ in ways):
-        for mirrored in (False, True):
-            if (motion := motion_of(found, own, radius, mirrored)) is not None:
-                own_frames = all(_at_origin(table) for table in (ground.stored, ground.own))
-                both = ", as both begin at 0, 0" * own_frames
-                ways.append((Explained.of(motion.near, every, right), "frame", f"{motion}{both}"))
-    best = max((some.share for some, *_ in ways if some.holds), default=0.0)
-    ways = [way for way in ways if way[0].holds and way[0].share >= best - NEARLY]
-    if not ways:
-        return []
-    # a move or a late clock supposes less than a turn or another rate
-    ways.sort(key=lambda way: (way[1] == "frame" or "run" in way[2], -way[0].answers))
-    (first, kind, _), words = ways[0], ", or ".join(way for *_, way in ways)
-    many = f"{first.answers} of {len(numbers)} confident answers agree with the coordinates of"
-    return [
-        Doubt(kind, f"the answers contradict the truth ({asked.truth}): {many} {ground.names[1]} {words}")
-    ]
+def _is_plain(made: Tensor, found: Tensor, within: float) -> bool:
+    """Whether more points (n,K) lie near those found than of pairs drawn at random."""
+    some, near = _some(len(made)), (made - found).norm(dim=1) <= within
+    by_chance = (torch.cdist(made[some], found[some]) <= within).double().mean()
+    return float(near.double().mean()) > OVER_CHANCE * float(by_chance)
 
 
-class Explained(NamedTuple):
-    """The share of the answers of which a relation tells something that it makes right, their number, and
-    whether that explains what the truth rejects: nine in ten, of many, while the truth rejects the others."""
+def _some(count: int, most: int = SOME) -> Tensor:
+    return torch.linspace(0, count - 1, min(most, count)).round().long()
 
-    share: float
+
+def relation_of(places: Tensor, queries: Tensor, within: int) -> Relation | None:
+    """The relation near which most answers lie; None if they are no more than with pairs drawn at random.
+
+    Example:
+        >>> queries = torch.arange(60)
+        >>> str(relation_of(6 * queries + 3, queries, within=5))
+        'place = 6 query + 3'
+    """
+    x, y = queries.double(), places.double()
+    fit, relation, answers = consensus(x + 0j, y + 0j, within), None, 0
+    if fit is not None:
+        near = fit.away <= within
+        slope, offset, answers = fit.turn.real, fit.move.real, int(near.sum())
+        simple = float(round(slope)) if abs(slope) >= 1 else 1 / round(1 / (slope or 1.0))
+        level = float((y - simple * x)[near].median())
+        if (as_many := int(((y - simple * x - level).abs() <= within).sum())) >= answers - AS_WELL * len(x):
+            slope, offset, answers = simple, level, as_many
+        relation = Relation(slope, offset, answers, len(x))
+    growing = _growing(x, y, within)
+    return growing if growing and growing.answers > answers + AS_WELL * len(x) else relation
+
+
+def _growing(x: Tensor, y: Tensor, within: int) -> Relation | None:
+    """An offset that only grows, or only falls, from the first query on, as where frames are missing."""
+    order = x.argsort(stable=True)
+    x, y = x[order], y[order]
+    for slope in (1.0, -1.0):
+        offset = y - slope * x
+        runs = offset.unfold(0, RUN, 1).median(1).values
+        middle = runs[(torch.arange(len(x)) - RUN // 2).clamp(0, len(runs) - 1)]
+        near = int(((offset - middle).abs() <= within).sum())
+        first, last = float(runs[0]), float(runs[-1])
+        way, steps = abs(last - first), float(runs[:: RUN // 2].diff().abs().sum())
+        if float((x + slope * middle).diff().min()) < -within:  # back to places that were passed
+            continue
+        one_way = float(steps) <= STRAY * way + within and within < way <= GROWN * float(x[-1] - x[0])
+        if near >= EXPLAINED * len(x) and one_way:
+            limit = min(within, way / APART)
+            before, after = (((offset - one).abs() <= limit).long() for one in (first, last))
+            fits = before.cumsum(0)[:-1] + after.flip(0).cumsum(0).flip(0)[1:]
+            at = int(fits.argmax())
+            jump = int(x[at + 1]) if int(fits[at]) >= EXPLAINED * len(x) else None
+            return Relation(slope, first, near, len(x), last, jump)
+    return None
+
+
+def _of_frames(relation: Relation, asked: Judged) -> Doubt:
+    """A relation between numbers of frames in words, with what would make the truth agree."""
+    many = f"{relation.answers} of {relation.confident} confident answers"
+    text = f"the answers contradict the truth ({asked.truth}): {many} follow {relation}"
+    jump, last = relation.jump, relation.last
+    if last is not None and jump is None:
+        what = "frames are missing, or their rates differ; pair frames by name or time in a --truth FILE.csv"
+        return Doubt("offset", f"{text}: {what}")
+    if relation.slope == 1.0 and jump is None:
+        return Doubt("offset", text, f"--truth {round(relation.offset)}")
+    at = relation.at(asked.queries)
+    there = asked.queries[(at >= 0) & (at < (asked.places or at.max() + 1))]
+    parts = [there] if jump is None else [there[there < jump], there[there >= jump]]
+    knots = [int(one) for part in parts if len(part) for one in part.aminmax()]
+    *some, end = (f"{query},{int(relation.at(torch.tensor(query)))}" for query in knots)
+    in_file = f"--interpolate and --truth FILE.csv with the lines {', '.join(some)} and {end}"
+    if last is not None:
+        grown = round(relation.slope * (last - relation.offset))
+        whose = "queries" if grown > 0 else "reference"
+        return Doubt("offset", f"{text}: {abs(grown)} frames of the {whose} are missing there", in_file)
+    if relation.slope < 0:
+        return Doubt("backwards", f"{text}: the queries run backwards", in_file)
+    if MISSING[0] < relation.slope < MISSING[1]:
+        grown, by = (round(relation.offset + (relation.slope - 1) * query) for query in knots)
+        text += f", so the offset goes from {grown} to {by}: frames are missing, or rates differ"
+    return Doubt("rate", text, in_file)
+
+
+def motion_of(found: Tensor, asked: Tensor, radius: float, mirrored: bool = False) -> Motion | None:
+    """The similarity that brings most points (n,2) of queries within a radius of those of their answers."""
+    own, there = (torch.complex(*one.T) for one in (asked, found))
+    motion = consensus(own.conj().resolve_conj() if mirrored else own, there, radius)
+    return motion and motion._replace(mirrored=mirrored)
+
+
+class Way(NamedTuple):
+    """What would make answers agree with coordinates, its cause and in words; how many it makes right, and
+    whether that explains what the truth rejects: nine in ten of those of which it tells something, of many,
+    while the truth rejects the others."""
+
+    cause: str
+    words: str
     answers: int
     holds: bool
 
     @classmethod
-    def of(cls, agree: Tensor, told: Tensor, right: Tensor) -> Explained:
-        """Of answers (n,) bool that agree, those of which something is told, and those that are right."""
-        answers, others = int((agree & told).sum()), right[~told]
-        share = answers / max(1, int(told.sum()))
-        wrong = not len(others) or float(others.double().mean()) <= REJECTED
-        many = answers >= max(LEAST, OVERLAP * len(told))
-        return cls(share, answers, share >= EXPLAINED and many and wrong)
+    def of(cls, cause: str, words: str, away: Tensor, right: Tensor, limit: float) -> Way:
+        """By how far answers (n,) are off by it, NaN where it tells nothing; `right` by the truth."""
+        untold, answers = away.isnan(), int((away <= limit).sum())
+        most = answers >= EXPLAINED * int((~untold).sum())
+        wrong = int((right & untold).sum()) <= REJECTED * int(untold.sum())
+        many = answers >= max(LEAST, OVERLAP * len(away))
+        return cls(cause, words, answers, most and many and wrong)
 
 
-def _rows(found: Tensor, queries: Tensor, right: Tensor, ground: Ground) -> Iterator[tuple[Explained, str]]:
-    """How numbers of queries are related to the frames whose coordinates are those of the answers, in words,
-    and what that explains: a difference of clocks, else another relation."""
+def _of_coordinates(asked: Judged, numbers: Tensor, ground: Ground, rejected: bool) -> list[Doubt]:
+    """What makes answers and coordinates agree, in words."""
+    found, own = ground.found[numbers], ground.asked[numbers]
+    known = (found.isfinite() & own.isfinite()).all(1)
+    found, own, numbers, confident = found[known], own[known], numbers[known], len(numbers)
+    if len(found) < LEAST:
+        return []
+    radius, unit, left, name = ground.near.radius, ground.near.unit, found - own, ground.names[1]
+    middle = left.median(0).values
+    moved, off = f"{_vector(*middle.tolist())} {unit}", (left - middle).norm(dim=1)
+    if not rejected:
+        away, spread = float(middle.norm()), float(off.median())
+        if away <= max(SPREADS * spread, radius / 2, _step(ground.stored)):  # as between two places
+            return []
+        seen = f"the confident answers lie {rounded(away)} {unit} from the coordinates of their queries"
+        seen = f"{seen}, in one direction, with a spread of {rounded(spread)} {unit}"
+        return [Doubt("shift", f"{seen}: they agree if those of {name} are {moved}")]
+    queries, right = asked.queries[numbers], asked.right[numbers]
+    ways = [Way.of("shift", moved, off, right, radius)] * _is_plain(found - middle, own, radius)
+    exchanged = (_at(ground.own, asked.match.index[numbers]) - _at(ground.stored, queries)).norm(dim=1)
+    ways.append(Way.of("exchanged", "with the two files exchanged", exchanged, right, radius))
+    found, own = found[:, :2], own[:, :2]
+    ways += _rows(found, queries, right, ground)
+    if not any(way.holds and way.answers >= EXPLAINED * len(found) for way in ways):
+        own_frames = all(_at_origin(table) for table in (ground.stored, ground.own))
+        both = ", as both begin at 0, 0" * own_frames
+        motions = (motion_of(found, own, radius, mirrored) for mirrored in (False, True))
+        ways += [Way.of("frame", f"{one}{both}", one.away, right, radius) for one in motions if one]
+    ways = [way for way in ways if way.holds]
+    if not ways:
+        return []
+    # a move or a late clock supposes less than a turn or another rate
+    ways.sort(key=lambda way: (way.cause == "frame" or "run" in way.words, -way.answers))
+    many = f"{ways[0].answers} of {confident} confident answers agree with the coordinates of {name}"
+    words = ", or ".join(way.words for way in ways)
+    return [Doubt(ways[0].cause, f"the answers contradict the truth ({asked.truth}): {many} {words}")]
+
+
+def _rows(found: Tensor, queries: Tensor, right: Tensor, ground: Ground) -> Iterator[Way]:
+    """How numbers of queries are related to the frames whose coordinates are those of the answers: by a
+    difference of clocks, else another relation."""
     own = ground.own[:, :2]
     rows = own.isfinite().all(1).nonzero()[:, 0]
-    if len(rows) < LEAST:
-        return
-    distance, nearest = zip(*(torch.cdist(part, own[rows]).min(1) for part in found.split(256)), strict=True)
-    near = torch.cat(distance) <= ground.near.radius
+    nearest = [torch.cdist(part, own[rows]).min(1) for part in found.split(256)]
+    away, at = (torch.cat(part) for part in zip(*nearest, strict=True))
+    near, at, usual = away <= ground.near.radius, rows[at], _step(own[rows]) or 1.0
     if near.sum() < LEAST:
         return
-    at, usual = rows[torch.cat(nearest)], _step(own[rows]) or 1.0
     within, limit = max(1, math.ceil(ground.near.radius / usual)), max(ground.near.radius, usual)
-
-    def away(row: Tensor, some: Tensor) -> tuple[Tensor, Tensor]:
-        """How far the coordinates of frames lie from those of the answers, and whether both are known."""
-        there = own[row.round().long().clamp(0, len(own) - 1)]
-        told = (row >= 0) & (row < len(own)) & there.isfinite().all(-1)
-        return (there - found[some]).norm(dim=-1), told
-
-    every = torch.arange(len(found))
-    some = every[torch.linspace(0, len(every) - 1, min(SOME, len(every))).round().long()]
-    late = (at - queries)[near].unique()
-    late = late[torch.linspace(0, len(late) - 1, min(SOME, len(late))).round().long()]
-    apart, told = away(queries[some] + late[:, None], some)
-    best = int(torch.where(told, apart, limit).clamp(max=limit).sum(1).argmin())
-    relations = (
-        Relation(1.0, float(late[best]), 0, 0),
-        relation_of(at[near], queries[near], min(within, len(rows) // 10)),
-    )
-    for relation in filter(None, relations):
-        apart, told = away(relation.slope * queries + relation.offset, every)
+    some, late = _some(len(found)), (at - queries)[near].unique()
+    late = late[_some(len(late))]
+    apart = (_at(own, queries[some] + late[:, None]) - found[some]).norm(dim=-1)
+    best = int(apart.nan_to_num(limit).clamp(max=limit).sum(1).argmin())
+    clock = Relation(1.0, float(late[best]), 0, 0)
+    other = relation_of(at[near], queries[near], min(within, len(rows) // 10))
+    for relation in filter(None, (clock, other)):
+        off = (_at(own, relation.at(queries)) - found).norm(dim=1)
         if relation.last is not None:
-            apart, told = torch.cat(distance), torch.ones_like(told)
-        explained = Explained.of(apart <= limit, told, right)
-        if explained.holds:
-            if relation.slope != 1 or relation.offset or relation.last is not None:
-                yield explained, _clock(relation, ground)
+            off = away.where(near, math.nan)  # the others lie where rows are missing
+        way = Way.of("clock", _clock(relation, ground), off, right, limit)
+        if way.holds:
+            if relation[:2] != (1, 0) or relation.last is not None:
+                yield way
             return
+
+
+def _at(table: Tensor, frames: Tensor) -> Tensor:
+    """The coordinates of frames, NaN beyond the ends."""
+    there = (frames >= 0) & (frames < len(table))
+    return table[frames.clamp(0, len(table) - 1)].where(there[..., None], math.nan)
 
 
 def _clock(relation: Relation, ground: Ground) -> str:
     """A relation between queries and the frames whose coordinates they should have, in words."""
+    missing = "rows are missing, or rates differ; pair by time or name"
     if relation.last is not None:
         sign, later = (1, "earlier") if relation.offset + relation.last > 0 else (-1, "later")
         ends = " to ".join(str(round(sign * one)) for one in (relation.offset, relation.last))
-        return f"if its rows are {ends} frames {later}"
-    rate = f"{abs(relation.slope):.4g} times as fast" * (abs(relation.slope) != 1)
-    if how := " and ".join(filter(None, ["backwards" * (relation.slope < 0), rate])):
-        return f"if its rows run {how}"
+        return f"if its rows are {ends} frames {later}: {missing}"
+    if relation.slope != 1:
+        rate = f"{abs(relation.slope):.4g} times as fast" * (abs(relation.slope) != 1)
+        how = " and ".join(filter(None, ["backwards" * (relation.slope < 0), rate]))
+        return f"if its rows run {how}" + f": {missing}" * (MISSING[0] < relation.slope < MISSING[1])
     later = "earlier" if relation.offset > 0 else "later"
     if ground.second is None:
         return f"if its rows are {abs(relation.offset):.0f} frames {later}"
     return f"if its times are {abs(relation.offset) * ground.second:.1f} s {later}"
-
-
-def _exchanged(places: Tensor, queries: Tensor, ground: Ground) -> tuple[Tensor, Tensor]:
-    """Which answers are right if the reference has the coordinates of the query, and the reverse; and of
-    which that can be told, (n,) bool."""
-    one, other = (
-        table[at.clamp(max=len(table) - 1)] for table, at in ((ground.own, places), (ground.stored, queries))
-    )
-    told = (places < len(ground.own)) & (queries < len(ground.stored)) & (one - other).isfinite().all(1)
-    return (one - other).norm(dim=1) <= ground.near.radius, told
 
 
 def _step(path: Tensor) -> float:
@@ -466,9 +442,11 @@ def _step(path: Tensor) -> float:
 
 
 def _at_origin(table: Tensor) -> bool:
-    known = table[table.isfinite().all(1)]
+    known = table[table.isfinite().all(1), :2]
     return bool(len(known) and (known[0].abs() < 1e-9).all())
 
 
-def _vector(x: float, y: float) -> str:
-    return f"moved by ({round(x, 1) + 0.0}, {round(y, 1) + 0.0})"  # never -0.0
+def _vector(*moved: float) -> str:
+    """A move in two or three numbers; the third is left out if it is about 0."""
+    numbers = [round(one, 1) + 0.0 for one in moved]  # never -0.0
+    return f"moved by ({', '.join(map(str, numbers if any(numbers[2:]) else numbers[:2]))})"

@@ -14,10 +14,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from dejavu_torch.data.arrays import UNNAMED
 from dejavu_torch.data.coordinates import Near
 from dejavu_torch.data.ground_truth import (
     GroundTruth,
+    Nowhere,
     Truth,
     check_ground_truth,
     check_unit,
@@ -252,7 +252,10 @@ def _planned(
     # without a given truth, each place would be its own answer
     known = None
     if truth is not None or not itself:
-        known = ground_truth_of(truth, reference, query, reporting.interpolate)
+        try:
+            known = ground_truth_of(truth, reference, query, reporting.interpolate)
+        except Nowhere as error:  # the answers may tell why, see `doubts_of`
+            known = error.truth
     reporting.check_contenders(COLOURS, known is not None, len(query) * headings, len(reference))
     if known is not None and near is None and reach.within > reach.tolerance:
         known = widened(known, layout, reach.within)
@@ -276,9 +279,6 @@ def _prepared(
         check_loops_along(reference.layout)
     off = reporting.off_map([reference] if query is None else [reference, query])
     query = reference if query is None else query
-    if loops is None and (query is reference or (reference.name == query.name != UNNAMED)):
-        line = "%s is matched with itself, each frame with its own copy; expected a second visit"
-        log.warning(line, query.name)
     reference = model.at_map_size(reference, model.frame_shape if has_map else None)
     query = model.at_map_size(query, reference.frame_shape)
     for other in off:

@@ -5,16 +5,18 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from dejavu_torch.data.coordinates import Near, coordinates_of
-from dejavu_torch.data.ground_truth import Truth, check_ground_truth, scored_and_right
+from dejavu_torch.data.ground_truth import Truth, check_ground_truth, describe_distant, scored_and_right
 from dejavu_torch.evaluation.agreement import Ground, Judged, coarse, contradictions
 from dejavu_torch.evaluation.answers import describe_line
 from dejavu_torch.evaluation.localization import Localization
 from dejavu_torch.evaluation.second_look import is_doubtful, second_look
 from dejavu_torch.maps.digest import digests_of
 from dejavu_torch.motion.resampling import source_of
+from dejavu_torch.recognition.provenance import THEMSELVES
 from dejavu_torch.recognition.select import PROBABLE
 from dejavu_torch.types import Doubt, Facts, Match, Traverse
 
@@ -26,8 +28,11 @@ def doubts_of(run: Localization, truth: Truth | None, facts: Mapping[str, Any]) 
     if run.querying.loops is not None:
         return []
     asked = run.query_features if run.causal_features is None else run.causal_features
-    digests = digests_of(asked[:: run.querying.copies], follow=False)
+    asked, own = asked[:: run.querying.copies].cpu(), run.reference_features.cpu()
+    digests = digests_of(asked, follow=False)
     known = run.model.provenance.doubts(run.model.map, digests, run.query)
+    if not known and asked.shape == own.shape and torch.allclose(asked, own, atol=1e-4):
+        known = [Doubt("provenance", THEMSELVES)]  # of a map without a digest
     return [*_judged(run, truth, facts), *known, *_otherwise(run)]
 
 
@@ -67,16 +72,19 @@ def ground_of(
     stored, own = coordinates_of([reference, query], near.kind)
     names, times = (reference.name, query.name), query.times
     second = None if times is None or len(times) < 2 else float(times[-1] - times[0]) / (len(times) - 1)
-    return Ground(near, stored[match.index], own[queries], stored, own, names, second)
+    apart = describe_distant(stored, own[queries], near, reference)
+    return Ground(near, stored[match.index], own[queries], stored, own, names, second, apart)
 
 
 def compared(asked: Judged, ground: Ground | None, facts: Mapping[str, Any]) -> list[Doubt]:
-    """What makes answers agree with the truth; else the line or shift of most of them that `facts` tell."""
+    """What makes answers agree with the truth; else the line or shift of most of them that `facts` tell, or
+    that coordinates make none of them right."""
     doubts = contradictions(asked, ground)
-    if not any(str(doubt).startswith(CONTRADICT) for doubt in doubts) and (
-        line := describe_line(facts, True)
-    ):
-        doubts.append(Doubt("line" if "line" in facts else "shift", line))
+    if not any(str(doubt).startswith(CONTRADICT) for doubt in doubts):
+        if line := describe_line(facts, True):
+            doubts.append(Doubt("line" if "line" in facts else "shift", line))
+        elif ground is not None and not facts["with_answer"]:
+            doubts.append(Doubt("nowhere", ground.apart))
     return doubts + ([] if ground is None else coarse(ground))
 
 

@@ -6,6 +6,7 @@ import logging
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
 from typing import NamedTuple
@@ -17,6 +18,7 @@ from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.coordinates import Near
 from dejavu_torch.data.ground_truth import (
     GroundTruth,
+    Nowhere,
     check_ground_truth,
     check_unit,
     counted,
@@ -107,11 +109,11 @@ class Asked:
     def doubts(self, place_map: PlaceMap | None, queries: Tensor, found: Tensor) -> list[Doubt]:
         """Whether queries (Q,), with places (Q,), are independent of the map, by some that show places with a
         digest, and those beside them; nothing without their source, or if the map cannot describe them."""
-        if self.map is None or self.query is None or place_map is None:
+        model = self._model
+        if model is None or self.query is None or place_map is None or model.step is not None:
             return []
         with suppress(InputError):
-            model, count = DejaVu.load(self.map), len(self.query)
-            expect(model.step is None, "frames as they are")
+            count = len(self.query)
             off = (found - place_map.digested[:, None]).abs()
             shown = off.argmin(1)[off.amin(1) <= 1] if off.numel() else found[:0]
             shown = queries[shown[:: -(-len(shown) // DESCRIBED) or 1]]
@@ -122,8 +124,16 @@ class Asked:
             return model.provenance.doubts(place_map, digests, self.query)
         return []
 
+    @cached_property
+    def _model(self) -> DejaVu | None:
+        """With the map, if there are queries that it can describe."""
+        with suppress(InputError):
+            return None if self.map is None or self.query is None else DejaVu.load(self.map)
+        return None
+
     def _map(self, map: Path) -> PlaceMap:
-        place_map = read_place_map(map)
+        model = self._model
+        place_map = model.map if model is not None and model.map.places else read_place_map(map)
         if self.route is None:
             place_map.layout.expect_one("--route with the one of the truth", str(map))
         if place_map.layout.count == 1 or not isinstance(place_map, SpectralMap):
@@ -172,7 +182,10 @@ def evaluate_file(
     queries, match, candidates = read_matches(matches, route, resampled, higher_is_better)
     highest = int(candidates.max())
     expect(frames is None or highest < frames, f"one below {frames}", f"{matches} reports place {highest}")
-    known = find_ground_truth(truth, reference, query, frames, queries, interpolate, resampled)
+    try:
+        known = find_ground_truth(truth, reference, query, frames, queries, interpolate, resampled)
+    except Nowhere as error:  # the answers may tell why
+        known = error.truth
     if known is None:
         raise InputError("there is no ground truth; expected one, or sources with coordinates")
     carried = all(traverse is not None and traverse.places is not None for traverse in (reference, query))

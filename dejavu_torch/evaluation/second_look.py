@@ -13,7 +13,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from dejavu_torch.data.traverse import Frames, Part, as_shape, fitted
-from dejavu_torch.data.turning import TURNS
+from dejavu_torch.data.turning import TURNS, composed
 from dejavu_torch.model import DejaVu
 from dejavu_torch.recognition.calibration import confidence_of
 from dejavu_torch.recognition.chosen import FAST, MOVES, SLOW
@@ -33,17 +33,22 @@ ENOUGH = 0.5  # share of the queries that are found, from which on all is well
 
 
 class Look(NamedTuple):
-    """Another way to look at frames. words: "they are turned". remedy: an option of a source, or words."""
+    """Another way to look at frames. words: "they are turned". remedy: one of `TURNS`, or words."""
 
     words: str
     alter: Callable[[Tensor], Tensor]  # (B,C,H,W) -> (B,C,H,W), or with sides exchanged
     remedy: str
 
-    def doubt(self, found: int, count: int, before: int) -> Doubt:
-        """That so many of `count` frames are found by it."""
+    def doubt(self, found: int, count: int, before: int, turn: str) -> Doubt:
+        """That so many of `count` frames are found by it, of a source that has a `turn`."""
         text = f"{found} of {count} frames are found if {self.words} ({before} as they are)"
-        is_option = self.remedy.startswith("?")
-        return Doubt("look", text if is_option else f"{text}; {self.remedy}", self.remedy * is_option)
+        remedy = self.remedy
+        if remedy in TURNS:
+            if option := composed(turn, remedy):
+                return Doubt("look", text, f"?turn={option}")
+            remedy = "remove its" if option == "" else "alter the pictures themselves, beside"
+            remedy += f" ?turn={turn}"
+        return Doubt("look", f"{text}; {remedy}")
 
 
 def _warped(scale: float, right: float = 0.0, down: float = 0.0) -> Callable[[Tensor], Tensor]:
@@ -79,7 +84,7 @@ BGR = Look(
     "red and blue are exchanged", lambda frames: frames.flip(1), "read the pictures as RGB, not as BGR"
 )
 LOOKS = (  # the more usual, the earlier
-    *(Look(words, TURNS[turn], f"?turn={turn}") for turn, words in TURNED.items()),
+    *(Look(words, TURNS[turn], turn) for turn, words in TURNED.items()),
     BGR,
     *(Look(f"they are {words}", _warped(*by), CROP) for words, by in WARPED.items()),
     Look("they are inverted", lambda frames: 1 - frames, "one of the two is a negative: invert its values"),
@@ -136,7 +141,7 @@ def second_look(model: DejaVu, query: Traverse, ordered: bool) -> list[Doubt]:
         if (monotonic() - began) * (count if len(asis) == 1 else 2) > SECONDS:
             return []
     del asis[0]
-    lost, told = [i for i, one in enumerate(asis) if not one.enough], list[tuple[float, Doubt]]()
+    lost = [i for i, one in enumerate(asis) if not one.enough]
     for i in lost if 2 * len(lost) >= len(asis) else ():
         best, by = asis[i], BGR
         for look in LOOKS:
@@ -148,12 +153,10 @@ def second_look(model: DejaVu, query: Traverse, ordered: bool) -> list[Doubt]:
             continue
         elsewhere = [(see(by.alter(parts[j])), asis[j]) for j in range(len(asis)) if j != i]
         worse = any(plain.enough and one <= plain for one, plain in elsewhere)
-        sure = not worse and (not ordered or any(one.enough for one, _ in elsewhere))
-        if sure or (not worse and gain >= 2 * CLEARLY[ordered]):
-            told.append((gain, by.doubt(best.found, count, asis[i].found)))
-        if sure:
-            break
-    return [doubt for _, doubt in sorted(told, reverse=True)[:1]]
+        sure = not ordered or gain >= 2 * CLEARLY[ordered] or any(one.enough for one, _ in elsewhere)
+        if sure and not worse:
+            return [by.doubt(best.found, count, asis[i].found, query.turn)]
+    return []
 
 
 def _as_drive(model: DejaVu, frames: Tensor) -> Seen:

@@ -39,6 +39,7 @@ SEEN: dict[Relation, str] = {
     "between": "frames between those of the map, as of the same drive",
 }
 SO = "another visit will be found less often"
+THEMSELVES = f"the queries are {SEEN['frames']}: {SO}"
 
 
 class Spread(NamedTuple):
@@ -207,10 +208,10 @@ def check_independent(place_map: PlaceMap, visit: Traverse, descriptors: Tensor)
     another visit with little noise do, too."""
     digests = digests_of(descriptors, follow=False)
     tells = len(visit.frame_shape) == 3 or place_map.dimension >= WIDE
-    found = relation(place_map, place_map.digest, digests, tells)
-    line = f"calibrating by {visit.name}: it has {SEEN[found]}" if found else ""
-    places, frames = signs_of(place_map.digest.cpu()), signs_of(digests[:ASKED])
-    equal = torch.cat([(part == 0).any(1) for part in _apart(places, frames)] or [places > 0]).double().mean()
-    expect(not found or equal < OWN or place_map.dimension < WIDE, "another visit", line)
-    if found:
-        log.warning("%s; probabilities may be too high", line)
+    if not (found := relation(place_map, place_map.digest, digests, tells)):
+        return
+    line = f"calibrating by {visit.name}: it has {SEEN[found]}"
+    apart = _apart(signs_of(place_map.digest.cpu()), signs_of(digests[:ASKED]))
+    equal = torch.cat([(part == 0).any(1) for part in apart]).double().mean()
+    expect(equal < OWN or place_map.dimension < WIDE, "another visit", line)
+    log.warning("%s; probabilities may be too high", line)

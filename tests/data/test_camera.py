@@ -16,6 +16,7 @@ from helpers import refused
 from videos import H264, clip, numbers, pictures, piped
 
 from dejavu_torch.data.camera import Camera, is_stream, stretched
+from dejavu_torch.data.turning import QUARTERS, TURNS, Upright
 from dejavu_torch.data.video import Video
 from dejavu_torch.types import InputError
 
@@ -63,6 +64,25 @@ def test_frames_are_brought_to_a_size_as_those_of_a_file(tmp_path, stream):
         "pipe: frames of 32 x 48 pixels are stretched to the map's 16 x 16"
     )
     assert torch.equal(torch.from_numpy(first.pixels.copy()).permute(2, 0, 1) / 255, expected)
+
+
+@pytest.mark.parametrize("turn", TURNS)
+def test_frames_are_turned_as_those_of_a_file(tmp_path, stream, turn):
+    """And brought to the size that a map has of turned ones."""
+    (tmp_path / "clip.ts").write_bytes(stream)
+    size = (24, 16) if QUARTERS[turn] % 180 else (16, 24)
+    expected = Upright(Video(tmp_path / "clip.ts", width=24, height=16), turn)[0]
+    with piped(tmp_path, stream) as pipe:
+        assert is_stream(f"{pipe}?turn={turn}")
+        camera = Camera(f"{pipe}?turn={turn}", size)
+        first = next(iter(camera))
+    assert camera.note == ""
+    assert torch.equal(torch.from_numpy(first.pixels).permute(2, 0, 1) / 255, expected)
+
+
+def test_a_turn_that_is_none_is_refused():
+    with refused("/dev/video0: turn=45", "expected 90, 180, 270"):
+        Camera("/dev/video0?turn=45")
 
 
 def test_the_end_of_an_address_is_told(tmp_path, stream):

@@ -177,8 +177,11 @@ def test_a_row_for_each_frame_that_has_no_name(text, tmp_path):
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("frame,x,y\n" + "\n".join(f"{i},{i},0" for i in range(1, 13)), ("1 frames beyond", "count from 1?")),
-        ("frame,x,y\n" + lines(lambda i: f"{i},{i},0", 15), ("3 frames beyond", "12", "0 to 11")),
+        (
+            "frame,x,y\n" + "\n".join(f"{i},{i},0" for i in range(1, 13)),
+            ("1 beyond", "frame 12", "count from 1?"),
+        ),
+        ("frame,x,y\n" + lines(lambda i: f"{i},{i},0", 15), ("3 beyond", "frame 12 to 14", "0 to 11")),
         ("frame,x,y\n" + lines(lambda i: f"{min(i, 4)},{i},0"), ("frame 4 twice",)),
         ("frame,x,y\n" + lines(lambda i: f"{i / 2},{i},0"), ("line 3", "0.5", "whole number")),
         ("name,x,y\n" + lines(lambda i: f"{min(i, 4):06}.png,{i},0"), ("line 7", "000004.png", "line 6")),
@@ -319,9 +322,11 @@ def test_a_column_of_coordinates_is_cut_with_the_frames(tmp_path, caplog):
     np.testing.assert_allclose(some.moves, [[0, 0], [5, 13**0.5], [9, 41**0.5]])
     assert some.metres
     assert "not used" not in caplog.text
+    assert caplog.text.count("the column moved is used as an odometer") == 2
     (tmp_path / "where.csv").write_text("x,y,moved\n" + "0,0,1\n" * 5 + "0,0,yes\n")
     assert open_source(source).odometer is None
     assert "the column moved is not used" in caplog.text
+    assert caplog.text.count("the column moved is used") == 2
     assert "line 7: moved is 'yes'" in caplog.text
 
 

@@ -359,7 +359,7 @@ def test_csv_is_read_leniently(tmp_path, text):
         ("0,1\n\n1,nan\n", ("line 3", "'nan'")),
         ("query;place\n0;1,5\n", ("line 2", "'1,5'")),
         ("0,1\n2,1\n0,3\n", ("line 3", "query 0", "twice")),
-        ("0,1\n-1,1\n", ("line 2", "query -1")),
+        ("0,1\n-1,1\n", ("line 2", "query is '-1'")),
         ("0,1\n1,8\n", ("line 2", "place 8", "0 to 7")),
         ("0,1\n1,-2\n", ("line 2", "place -2", "-1 for none")),
         ("0,1\n1,2.5\n", ("line 2", "place 2.5", "whole", "interpolation")),
@@ -692,7 +692,7 @@ def test_rows_beyond_the_last_frame_are_refused_but_for_a_stop(tmp_path, caplog)
         return find_ground_truth(tmp_path / "truth.csv", reference, query, 8, len(query))
 
     long = "\n".join(f"{i},{min(i, 7)}" for i in range(10))
-    with refused("lists 2 queries beyond the last frame: 8 to 9", "0 to 7"):
+    with refused("2 beyond the last frame: query 8 to 9", "0 to 7"):
         ask(long, frames_of(8))
     with refused("query 8", "count from 1?"):
         ask("\n".join(f"{i},{min(i, 7)}" for i in range(1, 9)), frames_of(8))

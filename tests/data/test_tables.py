@@ -74,7 +74,7 @@ def test_the_plain_name_goes_before_another_that_means_the_same(tmp_path):
 def test_rows_of_another_length_are_refused(tmp_path):
     table = table_of("x,y\n1,2\n3\n", tmp_path)
     with refused("line 3", "1 columns", "2 or more"):
-        table.check_width(2)
+        table.check_width("x", "y")
     with refused("line 3", "1 cells", "2 as in the header"):
         list(table.cells("a dot"))
     with refused("line 2", "3 cells", "a dot"):

@@ -15,7 +15,7 @@ from dejavu_torch import compare
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.coordinates import Near
 from dejavu_torch.evaluation.agreement import Ground, Judged, coarse, contradictions, motion_of, relation_of
-from dejavu_torch.evaluation.evaluate import ANYWHERE, evaluate_file
+from dejavu_torch.evaluation.evaluate import ANYWHERE, Asked, evaluate_file
 from dejavu_torch.evaluation.report import verdict
 from dejavu_torch.types import Coordinates, Match
 
@@ -53,7 +53,8 @@ def told(*args, **more):
         (299 - Q, "backwards", ("place = 299 - query", "run backwards", "lines 0,299 and 299,0")),
         (600 - 2 * Q, "backwards", ("place = 600 - 2 query",)),
         (Q + 20 * (Q // 75), "offset", ("goes from 0 to 60", "frames are missing", "by name or time")),
-        (Q + 60 * (Q >= 150), "offset", ("goes from 0 to 60",)),
+        (Q + 60 * (Q >= 150), "offset", ("goes from 0 to 60 at query 15", "60 frames of the queries")),
+        (600 - Q - 60 * (Q >= 150), "offset", ("goes from 600 to 540", "60 frames of the queries")),
         (400 - Q - 15 * (Q // 75), "offset", ("place = - query", "goes from 400 to 355")),
     ],
 )
@@ -71,13 +72,28 @@ def test_a_relation_between_frames_is_told(places, kind, words, share):
         assert word.replace("300 of", f"{300 - len(lost)} of") in text
 
 
+@pytest.mark.parametrize(("gap", "whose"), [(20, "queries"), (60, "queries"), (-60, "reference")])
+def test_an_offset_that_jumps_is_told_with_the_lines_that_mend_it(gap, whose):
+    """Answers within the gap of a reference are not sure."""
+    sure = Q[(Q < 150) | (150 - min(gap, 0) <= Q)]
+    first = int(sure[sure >= 150][0])
+    ((kind, text),) = told(sure + gap * (sure >= first), sure, sure)
+    assert kind == "offset"
+    assert (
+        f"goes from 0 to {gap} at query {first}: {abs(gap)} frames of the {whose} are missing there" in text
+    )
+    before = int(sure[sure < first][-1])
+    lines = f"0,0, {before},{before}, {first},{first + gap} and 299,{299 + gap}"
+    assert text.endswith(f"--interpolate and --truth FILE.csv with the lines {lines}")
+
+
 @given(st.floats(0.2, 4.0), st.integers(-200, 200), st.integers(0, 2**16))
 def test_a_line_is_found_within_its_width(slope, offset, seed):
     noise = torch.Generator().manual_seed(seed)
     places = (slope * Q + offset).round().long() + torch.randint(-2, 3, (300,), generator=noise)
     relation = relation_of(places, Q, 5)
     assert relation is not None
-    assert relation.explains
+    assert relation.answers >= 0.9 * relation.confident
     assert relation.last is None
     assert relation.slope * 150 + relation.offset == pytest.approx(slope * 150 + offset, abs=6)
 
@@ -93,6 +109,7 @@ def test_a_line_is_found_within_its_width(slope, offset, seed):
         (Q + 50 * ((Q >= 100) & (Q < 200)) + 20 * (Q >= 200), Q, {}),  # a third at a place that looks alike
         (torch.full_like(Q, 70), Q, {}),
         (torch.where(Q < 180, Q + 120, Q), Q, {}),  # most at a place that looks alike
+        (torch.where(Q < 150, Q, Q + 1000), Q, {}),  # half of it at one far ahead
         (Q + torch.randint(-2, 3, (300,), generator=torch.Generator().manual_seed(0)), Q, {"tolerance": 0}),
         (Q + 40, Q, {"sure": 0.8}),
         (Q + 40, Q, {"alone": torch.randperm(300, generator=torch.Generator().manual_seed(0))}),  # elsewhere
@@ -106,6 +123,7 @@ def test_a_line_is_found_within_its_width(slope, offset, seed):
         "alike",
         "one place",
         "most alike",
+        "half alike",
         "strict",
         "unsure",
         "single images deny",
@@ -179,6 +197,17 @@ def test_coordinates_that_agree_another_way(stored, own, more, kind, words):
     assert [doubt.kind for doubt in doubts] == ([] if kind is None else [kind])
     for word in words:
         assert word in str(doubts[0])
+
+
+@pytest.mark.parametrize("rows", [Q + 20 * (Q // 75), Q + 60 * (Q >= 150), Q + 100 * (Q >= 100)])
+@pytest.mark.parametrize("whose", ["a.csv", "b.csv"])
+def test_coordinates_in_whose_file_rows_are_missing(rows, whose):
+    """Frames have the fixes of the rows of their numbers, by either file."""
+    stored, own = (road(torch.arange(500)), road(rows)) if whose == "b.csv" else (road(rows), PATH)
+    (doubt,) = contradictions(*grounds(stored, own))
+    assert doubt.kind == "clock"
+    assert f"if its rows are 0 to {int(rows[-1]) - 299} frames" in doubt.text
+    assert "rows are missing, or rates differ; pair by time or name" in doubt.text
 
 
 @pytest.mark.parametrize(
@@ -264,26 +293,69 @@ def test_coordinates_too_coarse_for_the_radius():
     ("above", "radius", "floors"),
     [(4.0, 5.0, True), (4.0, 3.0, False), (0.0, 5.0, False), (None, 25.0, False)],
 )
-def test_floors_within_the_radius(above, radius, floors):
-    """None: heights of a receiver, which merely vary."""
+@pytest.mark.parametrize("whose", [0, 1])
+def test_floors_within_the_radius(above, radius, floors, whose):
+    """Of one visit, which passes both. None: heights of a receiver, which merely vary."""
     draw = torch.Generator().manual_seed(0)
     height = torch.full((300,), above or 0.0) if above is not None else 4 * torch.randn(300, generator=draw)
     one = torch.cat([PATH, torch.zeros(300, 1)], 1)
-    other = torch.cat([PATH, height[:, None]], 1)
-    _, ground = grounds(one, other, radius=radius)
+    both = torch.cat([one, torch.cat([PATH, height[:, None]], 1)])
+    _, ground = grounds(*((both, one), (one, both))[whose], radius=radius)
     doubts = coarse(ground)
     assert [doubt.kind for doubt in doubts] == ["heights"] * floors
     assert not floors or ("4 m above" in str(doubts[0]) and "--truth metres:2" in str(doubts[0]))
 
 
+@pytest.mark.parametrize(("above", "radius"), [(4.0, 5.0), (4.0, 3.0), (40.0, 25.0), (2.0, 25.0)])
+def test_heights_of_two_visits_that_differ_by_a_constant_are_moved(above, radius):
+    """Not floors, as those of one visit are; a small part of the radius tells nothing."""
+    one = torch.cat([PATH, torch.zeros(300, 1)], 1)
+    judged, ground = grounds(one, one + torch.tensor([0.0, 0.0, above]), radius=radius)
+    doubts = contradictions(judged, ground) + coarse(ground)
+    assert [doubt.kind for doubt in doubts] == ["shift"] * (above > radius / 2)
+    assert all(f"moved by (0.0, 0.0, {-above}) m" in str(doubt) for doubt in doubts)
+
+
+def visits(stored, own, noise):
+    """Two with coordinates, the second with so much noise."""
+    rows, other = (torch.randn(300, 16, generator=torch.Generator().manual_seed(seed)) for seed in (0, 1))
+    rows = torch.nn.functional.normalize(rows, dim=1)
+    reference, query = ArrayTraverse(rows, "a"), ArrayTraverse(rows + noise * other, "b")
+    reference.coordinates, query.coordinates = Coordinates(stored), Coordinates(own)
+    return reference, query
+
+
+@pytest.mark.parametrize(
+    ("own", "noise", "kind", "words"),
+    [
+        ((PATH - PATH[50]) @ TURN.T + 5000, 0.15, "frame", "turned by -40.1 degrees and moved by ("),
+        (PATH + 5000, 0.15, "shift", "moved by (-5000.0, -5000.0) m"),
+        (
+            PATH + 5000,
+            9.0,
+            "nowhere",
+            "their middle is 7071 m from that of a; expected coordinates in one sys",
+        ),
+    ],
+)
+def test_coordinates_by_which_none_is_right_are_held_against_the_answers(own, noise, kind, words, tmp_path):
+    reference, query = visits(PATH, own, noise)
+    report = compare(reference, query, "metres:5", tolerance=5).report
+    (doubt,) = (doubt for doubt in report.facts["doubts"] if doubt["kind"] != "provenance")
+    assert doubt["kind"] == kind
+    assert words in doubt["text"]
+    assert report.ours.scores.auc == report.facts["with_answer"] == 0
+    assert ("which the answers contradict" in verdict(report)) == (noise < 1)
+    found = torch.arange(300) if noise < 1 else torch.randperm(300)
+    rows = "".join(f"{i},{int(found[i])},0.1\n" for i in range(300))
+    (tmp_path / "m.csv").write_text(f"query,place,score\n{rows}")
+    report = evaluate_file(tmp_path / "m.csv", "metres:5", asked=Asked(reference, query)).report
+    assert [doubt["kind"] for doubt in report.facts["doubts"]] == [kind]
+
+
 def test_a_report_tells_it_first(tmp_path, capsys):
     """On the terminal, at the top of the page, and in report.json; the verdict is not that of the map."""
-    rows = torch.nn.functional.normalize(
-        torch.randn(300, 16, generator=torch.Generator().manual_seed(0)), dim=1
-    )
-    other = 0.15 * torch.randn(300, 16, generator=torch.Generator().manual_seed(1))
-    reference, query = ArrayTraverse(rows, "a"), ArrayTraverse(rows + other, "b")
-    reference.coordinates, query.coordinates = Coordinates(PATH), Coordinates((PATH - PATH[50]) @ TURN.T)
+    reference, query = visits(PATH, (PATH - PATH[50]) @ TURN.T, 0.15)
     found = compare(reference, query, "metres:25", tolerance=5)
     (doubt,) = found.report.facts["doubts"]
     assert doubt["kind"] == "frame"

@@ -116,13 +116,13 @@ def test_a_reference_of_other_features_than_the_map_s_is_refused(trained):
         compare(torch.rand(240, 6), torch.rand(240, 6), "0", model=trained)
 
 
-def test_a_traverse_matched_with_itself_is_warned_of(model, caplog):
-    same = route(0)
-    compare(same, same, "0", model=model)
-    assert "matched with itself" in caplog.text
-    caplog.clear()
-    compare(same, route(1), "0", model=template_model())  # two tensors, neither of which has a name
-    assert "matched with itself" not in caplog.text
+@pytest.mark.parametrize("again", [route(0), route(1)])
+def test_a_traverse_matched_with_itself_is_told_once(model, again, caplog):
+    """Of tensors without names, and by a map of templates, which has no digest."""
+    found = compare(route(0), again, "0", model=model)
+    told = [doubt["text"] for doubt in found.report.facts["doubts"] if doubt["kind"] == "provenance"]
+    assert ["frames of the map itself" in one for one in told] == [True] * torch.equal(again, route(0))
+    assert "itself" not in caplog.text
 
 
 def test_a_map_of_another_route_is_warned_of(caplog):

@@ -16,7 +16,7 @@ from torch import nn
 from dejavu_torch import HOG, DejaVu, Preprocess, SpectralMapper, Whitening, open_source
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.traverse import Frames, Part
-from dejavu_torch.data.turning import TURNS
+from dejavu_torch.data.turning import TURNS, Upright
 from dejavu_torch.evaluation import second_look as looking
 from dejavu_torch.evaluation.second_look import CROP, LOOKS, _warped, is_doubtful, second_look
 from dejavu_torch.features.pixels import PatchPixels
@@ -64,6 +64,26 @@ def test_turned_queries_are_told_with_the_option_that_turns_them_back(turn, mode
     found, doubtful = found_by(model, Frames(TURNS[back](altered[:]).contiguous()))
     assert found > 150
     assert not doubtful
+
+
+@pytest.mark.parametrize(
+    ("taken", "turn", "option", "words"),
+    [
+        ("180", "90", "?turn=180", "turned by 90 degrees"),
+        ("", "270", "", "turned by 90 degrees (0 as they are); remove its ?turn=270"),
+        ("transpose", "90", "?turn=transpose", "mirrored"),
+    ],
+)
+def test_a_source_that_is_turned_already_is_told_the_turn_that_it_should_have(
+    taken, turn, option, words, model, drive
+):
+    """Its frames as the camera took them, and what they are turned by."""
+    camera = Frames(TURNS[taken](drive).contiguous() if taken else drive)
+    (doubt,) = second_look(model, Upright(camera, turn), ordered=True)
+    assert words in doubt.text
+    assert doubt.option == option
+    if option:
+        assert found_by(model, Upright(camera, option.removeprefix("?turn=")))[0] > 150
 
 
 @pytest.mark.parametrize(
@@ -174,6 +194,11 @@ def test_real_drives_are_told_if_they_are_turned_and_only_then(reference, query)
     for turn in ("180", "transpose"):
         (doubt,) = second_look(model, Frames(TURNS[turn](shown[:]).contiguous()), True)
         assert doubt.option == f"?turn={turn}"
+
+
+def test_turns_that_are_none_together_have_words():
+    half = next(look for look in LOOKS if look.remedy == "180")
+    assert half.doubt(3, 4, 0, "mirror").text.endswith("; alter the pictures themselves, beside ?turn=mirror")
 
 
 def test_every_look_changes_a_picture_and_has_words_and_a_remedy():

@@ -719,15 +719,15 @@ MUTANTS = [
     Mutant(
         "Odometry begins at 0, 0: only fixes there that lie far from the next one are none.",
         "dejavu_torch/data/fixes.py",
-        "and _far(values, at, degrees)",
+        "and _far(metres(values, degrees), at)",
         "",
         ("tests/data/test_fixes.py::-k camera_does",),
     ),
     Mutant(
         "A camera that stops goes on from where it was: its fix is not held.",
         "dejavu_torch/data/fixes.py",
-        "length >= HELD and step > max(MADE_UP, length / MADE_UP) * usual",
-        "length >= HELD",
+        "made_up & (lengths >= HELD)",
+        "(lengths >= HELD)",
         ("tests/data/test_fixes.py::-k camera_does",),
     ),
     Mutant(

@@ -12,9 +12,10 @@ from command_line import fails, run
 from helpers import long_from, refused
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from dejavu_torch import HOG, DejaVu, Preprocess, SpectralMapper, Whitening, compare, open_source
+from dejavu_torch import HOG, DejaVu, Preprocess, SpectralMapper, Whitening, compare, model_file, open_source
 from dejavu_torch.data.arrays import ArrayTraverse
 from dejavu_torch.data.traverse import Chain, Part
+from dejavu_torch.evaluation.evaluate import Asked, evaluate_file
 from dejavu_torch.evaluation.options import Learning
 from dejavu_torch.features.views import LabelledFrames
 from dejavu_torch.growth import append, average, learn_mean, merge, only_route
@@ -506,6 +507,19 @@ def test_commands_say_it_once(tmp_path, capsys):
         assert len(json.loads((out / "report.json").read_text())["doubts"]) == bool(line)
     run("info", path)
     assert "taught by" not in capsys.readouterr().out
+
+
+def test_a_map_is_read_once_to_say_it(tmp_path, monkeypatch):
+    model, rows, path = learned(drive(100)), drive(100), tmp_path / "m.safetensors"
+    model.save(path)
+    reads = []
+    monkeypatch.setattr(model_file, "read_map", lambda path: reads.append(path) or read_map(path))
+    (tmp_path / "m.csv").write_text("query,place,score\n" + "".join(f"{i},{i},0\n" for i in range(100)))
+    for query, said in ((ArrayTraverse(rows, "own"), 1), (None, 0)):
+        reads.clear()
+        found = evaluate_file(tmp_path / "m.csv", "0", asked=Asked(map=path, query=query))
+        assert [doubt["text"].startswith(SAYS) for doubt in found.report.facts["doubts"]] == [True] * said
+        assert reads == [path]
 
 
 def test_copies_that_are_moved_are_not_compared():
