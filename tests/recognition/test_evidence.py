@@ -46,13 +46,22 @@ def test_queries_that_remember_say_as_much_as_fewer(share):
         assert 1 + 2 * sum(lags) == pytest.approx((1 + share) / (1 - share), rel=0.12)
 
 
+def test_what_returns_makes_no_neighbours_alike():
+    returning = torch.tensor([[1.0], [-0.5], [-0.5]]).repeat(1000, 1) * math.sqrt(2)  # every third query
+    slow = remembering(3000, 1, 0.9)
+    queries = torch.cat([slow / slow.std(), returning], 1)
+    lags = [(0.9**k + (1 if k % 3 == 0 else -0.5)) / 2 for k in range(1, 4)]
+    assert lags[2] > lags[1] > 0.05
+    assert correlation_time(queries) == pytest.approx(1 + 2 * sum(lags[:2]), abs=0.15)
+
+
 @given(st.integers(0, 9), st.integers(1, 30))
 def test_the_correlation_time_is_a_sum_over_pairs(seed, rows):
     queries = noise(rows, 3, seed).cumsum(0)
     centred = (queries - queries.mean(0)).double()
     lags = [float((centred[k:] * centred[: rows - k]).sum() / (rows - k)) for k in range(rows)]
     total, k = 1.0, 1
-    while k < rows and lags[k] / lags[0] >= 0.05:
+    while k < rows and lags[k] / lags[0] >= 0.05 and lags[k] <= lags[k - 1]:
         total, k = total + 2 * lags[k] / lags[0], k + 1
     if k < rows:
         assert correlation_time(queries) == pytest.approx(total)
