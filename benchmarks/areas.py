@@ -30,6 +30,7 @@ SEEDS = (1, 2, 3)  # of whitening, queries, codebooks and the order of the contr
 STRIDE, QUERIES = 4, 1500  # pixels of 12.5 cm; queries at any offset
 RADIUS = 10.0  # pixels
 PACE = 8.0  # pixels from one image of a flight to the next, on a course that winds
+APART, LINE, SURVEYED = 25, 700, 400  # pixels between lines of a survey, and of a line; its images
 FLOWN = ("map", "null", "uncompressed")
 SKIPPED = int(
     2 * RADIUS / STRIDE
@@ -37,6 +38,7 @@ SKIPPED = int(
 BYTES = (0.3, 0.42, 1.0, 2.2, 4.0)
 CODES = (1, 2, 4)
 FLIGHT = ("flight", "flight_accepted_wrong", "flight_on_the_way")
+SURVEY = ("survey", "survey_accepted_wrong", "survey_on_the_way")
 NAMES = {
     "map": "this map, both directions",
     "rows": "maps of its rows",
@@ -89,8 +91,11 @@ def measured(seed: int) -> list[Row]:
     where, own = reference.coordinates, second.coordinates
     assert where is not None
     assert own is not None
-    path = second.layout.place_at(flight(second.layout, draw))
-    flown = torch.cat([model.descriptor(second[part.tolist()]) for part in path.split(64)])
+    flights = []
+    for names, cells in ((FLIGHT, flight(second.layout, draw)), (SURVEY, survey(second.layout, draw))):
+        path = second.layout.place_at(cells)
+        described = [model.descriptor(second[part.tolist()]) for part in path.split(64)]
+        flights.append((names, own.values[path], torch.cat(described)))
     rows = []
     for key, size, score in ways_of(places, reference.layout, seed):
         asked_by = score(queries)
@@ -101,19 +106,19 @@ def measured(seed: int) -> list[Row]:
         right = (where.values[best] - own.values[asked]).norm(dim=1) <= RADIUS
         row: Row = {"seed": seed, "contender": key, "bytes_per_place": size}
         rows.append(row | {"recall_at_1": float(right.double().mean())})
-        if key in FLOWN:
+        for names, at, flown in flights if key in FLOWN else ():
             smoother = PlaceSmoother(within=round(RADIUS / STRIDE))
             scorer = score(flown)
             found = localize_drive(DriveQuery(scorer, smoother, radius=0, asks=False))
-            right = (where.values[found.index[:, 0]] - own.values[path]).norm(dim=1) <= RADIUS
+            right = (where.values[found.index[:, 0]] - at).norm(dim=1) <= RADIUS
             sure = found.probability[:, 0] >= 0.5 if found.probability is not None else right
             matcher = Localizer(None, Matching(PlaceFilter()), layout=reference.layout)
             live = matcher.match(
                 torch.cat([scorer.rows(part) for part in torch.arange(len(flown)).split(64)])
             ).index
-            on_the_way = (where.values[live] - own.values[path]).norm(dim=1) <= RADIUS
+            on_the_way = (where.values[live] - at).norm(dim=1) <= RADIUS
             shares = right, sure & ~right, on_the_way
-            rows[-1] |= {key: float(one.double().mean()) for key, one in zip(FLIGHT, shares, strict=True)}
+            rows[-1] |= {name: float(one.double().mean()) for name, one in zip(names, shares, strict=True)}
     return rows
 
 
@@ -127,6 +132,20 @@ def flight(area: Layout, draw: torch.Generator) -> Tensor:
         if not 0 <= at[0] <= area.rows - 1:  # turns back at the border
             at[0], course = at[0].clamp(0, area.rows - 1), -course
     return torch.stack(cells)
+
+
+def survey(area: Layout, draw: torch.Generator) -> Tensor:
+    """Cells of windows along lines there and back, from the middle on, with a little wind, (n,2)."""
+    at, cells = torch.tensor([float(APART) / 2, area.columns / 2]), []
+    pace, first = PACE, float(at[1])
+    for _ in range(SURVEYED):
+        wind = 2 * torch.randn(2, generator=draw)
+        cells.append((at + wind).round().long())
+        at[1] += pace
+        if not first <= at[1] < first + LINE:  # the next line
+            pace, at[0] = -pace, (at[0] + APART) % area.rows
+    most = torch.tensor([area.rows - 1, area.columns - 1])
+    return torch.stack(cells).clamp(min=0).minimum(most)
 
 
 def plot_areas(rows: list[Row]) -> Plot:
@@ -152,11 +171,13 @@ def run_areas(*, out: Path) -> list[str]:
     Args:
         out: folder for bench.json and bench.png
     """
-    means = summarised([row for seed in SEEDS for row in measured(seed)], ("recall_at_1", *FLIGHT))
+    means = summarised([row for seed in SEEDS for row in measured(seed)], ("recall_at_1", *FLIGHT, *SURVEY))
     write_bench(out, means, plot_areas(means), seeds=list(SEEDS), radius=RADIUS)
-    lines = [f"{'':<38}{'bytes':>8}{'one image':>11}{'flight':>8}{'on the way':>12}"]
+    lines = [f"{'':<38}{'bytes':>8}{'one image':>11}{'flight':>8}{'on the way':>12}{'survey':>8}"]
     for row in means:
         name = NAMES[row["contender"]]
-        whole = "".join(f"{row[key]:>{8 + 4 * (key == FLIGHT[2])}.3f}" for key in FLIGHT[::2] if key in row)
+        whole = "".join(
+            f"{row[key]:>{8 + 4 * (key == FLIGHT[2])}.3f}" for key in (*FLIGHT[::2], SURVEY[0]) if key in row
+        )
         lines.append(f"{name:<38}{row['bytes_per_place']:>8}{row['recall_at_1']:>11.3f}{whole}")
     return [*lines, f"means of {len(SEEDS)} seeds"]

@@ -523,7 +523,7 @@ def areas() -> str:
     """Recall@1 of one image on an area by ways to store it, over their bytes."""
     found: dict[str, dict[float, str]] = {}
     for row in read("areas")["rows"]:
-        whole = "".join(f"/{row[key]:.3f}" for key in ("flight_on_the_way", "flight") if key in row)
+        whole = "".join(f"/{row[key]:.3f}" for key in ("flight_on_the_way", "flight", "survey") if key in row)
         found.setdefault(row["contender"], {})[row["bytes_per_place"]] = f"{row['recall_at_1']:.3f}{whole}"
     sizes = sorted({each for own in found.values() for each in own})
     table = [["bytes per window", *(f"{each:g}" for each in sizes)]]

@@ -145,9 +145,9 @@ def run_lengths(same: Tensor, counts: Tensor | None = None) -> Tensor:
 
 def correlation_time(queries: Tensor) -> float:
     """1 + 2 x the autocorrelations of the centred descriptors (Q,K), up to the first below .05 or above the
-    one before it: beyond that, places that are passed again make queries alike.
+    two before it: beyond that, places that are passed again make queries alike.
 
-    Source: the initial monotone sequence of Geyer, Statistical Science 7 (1992).
+    Source: the initial monotone sequence of Geyer, Statistical Science 7 (1992), but for what alternates.
 
     Example:
         >>> correlation_time(torch.tensor([[1.0], [-1], [1], [-1]]))
@@ -165,8 +165,8 @@ def correlation_time(queries: Tensor) -> float:
         return 1.0
     lags = torch.fft.irfft(power, n=2 * count)[:count] / torch.arange(count, 0, -1, device=power.device)
     lags = lags / lags[0]
-    rises = lags.diff(prepend=lags[:1]) > 0
-    ends = ((lags < chosen.SMALLEST) | rises).nonzero()
+    before = F.pad(lags, (2, 0), value=1.0).unfold(0, 2, 1).amax(1)[:count]
+    ends = ((lags < chosen.SMALLEST) | (lags > before)).nonzero()
     last = int(ends[0]) if len(ends) else max(1, count // 2)  # longer lags have few pairs
     return 1 + 2 * float(lags[1:last].sum())
 
