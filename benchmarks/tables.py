@@ -477,6 +477,18 @@ def constants() -> str:
     return markdown(table)
 
 
+def own_copies() -> str:
+    """Mean AUC of drives with the usual setting, that which is best on copies of the map's frames, and on the
+    drives themselves."""
+    cases = by("case", read("own_copies")["rows"])
+    names = [row["contender"] for row in next(iter(cases.values()))]
+    table = [["AUC (setting)", *names]]
+    for case, rows in cases.items():
+        table.append([case, *(f"{row['auc']:.3f} ({row['setting']})" for row in rows)])
+    means = (mean(own[i]["auc"] for own in cases.values()) for i in range(len(names)))
+    return markdown([*table, ["mean", *(f"{one:.3f}" for one in means)]])
+
+
 def large_drives() -> str:
     """Time and memory of drives on large maps, and what they find."""
     table = [["queries, places, B per place", "one image", "whole drive", "at all places", "s", "MB"]]
@@ -685,6 +697,7 @@ TABLES: dict[str, Callable[[], str]] = {
     **{"rejection": rejection, "filtered": filtered, "drives": drives, "driven": driven},
     **{"trainings": trainings, "made drives": made_drives, "storage drives": storage_drives},
     **{"cross": cross, "ends": left, "ends before": partial(left, "ends before"), "chosen": constants},
+    "own_copies": own_copies,
     **{
         "areas": areas,
         "headings": headings,
