@@ -247,7 +247,7 @@ def _seen(
 def _of_flight(asked: DriveQuery, progress: bool) -> Iterator[tuple[DriveQuery, Seen]]:
     """What is seen of a drive over an area."""
     scorer = asked.scorer
-    spacing, queries = spacing_of(check_descriptors(scorer.descriptors)), len(scorer)
+    spacing, queries = spacing_of(check_descriptors(scorer.descriptors), monotone=True), len(scorer)
     flight = Flight(asked.smoother, scorer.rows, queries, scorer.layout, spacing)
     asked = asked.fitted(flight.smoother, spacing)
     yield asked, Seen(flight.masses(asked.smoother).double(), flight.scores)

@@ -39,14 +39,14 @@ class Spacing(NamedTuple):
     stale: Tensor
 
 
-def spacing_of(queries: Tensor) -> Spacing:
-    """The spacing of consecutive queries by their descriptors (Q,K)."""
+def spacing_of(queries: Tensor, monotone: bool = False) -> Spacing:
+    """The spacing of consecutive queries by their descriptors (Q,K); monotone: as in `correlation_time`."""
     queries = queries.cpu().float()
     same, stale = unchanged(queries) | standing(queries), repeats(queries)
     fresh = stale == 0
     length = run_lengths(same, fresh)
     stopped = same & fresh & (length > chosen.STOP)
-    return Spacing(fresh / length, stopped, correlation_time(queries[~same]), stale)
+    return Spacing(fresh / length, stopped, correlation_time(queries[~same], monotone), stale)
 
 
 def repeats(queries: Tensor, before: Tensor | None = None, so_far: int = 0) -> Tensor:
@@ -143,11 +143,13 @@ def run_lengths(same: Tensor, counts: Tensor | None = None) -> Tensor:
     return run.bincount(None if counts is None else counts.double())[run].float()
 
 
-def correlation_time(queries: Tensor) -> float:
-    """1 + 2 x the autocorrelations of the centred descriptors (Q,K), up to the first below .05 or above the
-    two before it: beyond that, places that are passed again make queries alike.
+def correlation_time(queries: Tensor, monotone: bool = False) -> float:
+    """1 + 2 x the autocorrelations of the centred descriptors (Q,K), up to the first below .05.
 
-    Source: the initial monotone sequence of Geyer, Statistical Science 7 (1992), but for what alternates.
+    Args:
+        monotone: or up to the first above the two before it: beyond that, places that are passed again make
+            queries alike, as in lines there and back over an area. Source: the initial monotone sequence of
+            Geyer, Statistical Science 7 (1992), but for what alternates.
 
     Example:
         >>> correlation_time(torch.tensor([[1.0], [-1], [1], [-1]]))
@@ -166,7 +168,7 @@ def correlation_time(queries: Tensor) -> float:
     lags = torch.fft.irfft(power, n=2 * count)[:count] / torch.arange(count, 0, -1, device=power.device)
     lags = lags / lags[0]
     before = F.pad(lags, (2, 0), value=1.0).unfold(0, 2, 1).amax(1)[:count]
-    ends = ((lags < chosen.SMALLEST) | (lags > before)).nonzero()
+    ends = ((lags < chosen.SMALLEST) | (monotone & (lags > before))).nonzero()
     last = int(ends[0]) if len(ends) else max(1, count // 2)  # longer lags have few pairs
     return 1 + 2 * float(lags[1:last].sum())
 
