@@ -290,8 +290,10 @@ def by_heading(kernel, headings):
         for i, j in itertools.product(range(-reach, reach + 1), repeat=2):
             away = math.atan2(i, j) - 2 * math.pi * h / headings
             share[reach + i, reach + j] = math.exp(8 * (math.cos(away) - 1))
-        share[reach, reach] = 0.1434  # exp(8 (cos a - 1)) over all directions a, in the mean
-        kernels.append(kernel * share / (kernel * share).sum() * kernel.sum())
+        share[reach, reach] = 0
+        stands, goes = kernel[reach, reach], kernel * share
+        kernels.append(goes / goes.sum() * (kernel.sum() - stands))
+        kernels[-1][reach, reach] = stands
     return kernels, change
 
 

@@ -140,15 +140,15 @@ class Followed(NamedTuple):
 
 def by_heading(moves: Tensor, headings: int) -> Tensor:
     """Moves (2 V + 1, 2 V + 1) by rows and columns, those of each heading (H, 2 V + 1, 2 V + 1), around which
-    directions have the distribution of von Mises; to stand still goes with all."""
+    directions have the distribution of von Mises; each stands still as often."""
     if headings == 1:
         return moves[None]
     away = torch.arange(len(moves)).to(moves) - len(moves) // 2
     course = torch.atan2(away[:, None], away) - 2 * math.pi / headings * torch.arange(headings)[:, None, None]
-    share = (chosen.COURSE * (course.cos() - 1)).exp()
-    share[:, away == 0, away == 0] = torch.special.i0e(torch.tensor(chosen.COURSE)).to(moves)  # the mean
-    found = moves * share
-    return found * (moves.sum() / found.sum((1, 2), keepdim=True))
+    stands = (away == 0) & (away == 0)[:, None]
+    found = (moves * (chosen.COURSE * (course.cos() - 1)).exp()).masked_fill(stands, 0)
+    total = found.sum((1, 2), keepdim=True).clamp(min=MIN_PROBABILITY)
+    return torch.where(stands, moves, found * ((moves * ~stands).sum() / total))
 
 
 def turns(headings: int) -> Tensor:
