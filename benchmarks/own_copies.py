@@ -42,7 +42,7 @@ SETTINGS = {
     for (family, values), tempering in product(FAMILIES.items(), (0.3, 0.6, 1.2))
 }
 USUAL, HINDSIGHT = "both, 0.6", "in hindsight"
-KEYS = "setting", "auc", "copies", "tau"
+KEYS = "setting", "auc", "copies", "tau", "skipped"
 COLUMNS: dict[str, Column] = {"AUC": ("auc", ".3f"), "of copies": ("copies", ".3f"), "tau": ("tau", ".1f")}
 
 

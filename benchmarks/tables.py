@@ -477,6 +477,16 @@ def constants() -> str:
     return markdown(table)
 
 
+def odometry() -> str:
+    """AUC of whole drives and filters by odometry."""
+    names = ("without", "noise", "too long")
+    table = [["AUC of drive / filter", *names]]
+    for case, rows in by("case", read("odometry")["rows"]).items():
+        own = {row["contender"]: row for row in rows}
+        table.append([case, *(f"{own[name]['drive']:.3f} / {own[name]['filter']:.3f}" for name in names)])
+    return markdown(table)
+
+
 def own_copies() -> str:
     """Mean AUC of drives with the usual setting, that which is best on copies of the map's frames, and on the
     drives themselves."""
@@ -697,7 +707,7 @@ TABLES: dict[str, Callable[[], str]] = {
     **{"rejection": rejection, "filtered": filtered, "drives": drives, "driven": driven},
     **{"trainings": trainings, "made drives": made_drives, "storage drives": storage_drives},
     **{"cross": cross, "ends": left, "ends before": partial(left, "ends before"), "chosen": constants},
-    "own_copies": own_copies,
+    **{"own_copies": own_copies, "odometry": odometry},
     **{
         "areas": areas,
         "headings": headings,

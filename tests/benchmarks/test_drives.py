@@ -10,7 +10,17 @@ import torch
 from command_line import benchmark
 from torch.nn.functional import normalize
 
-from benchmarks import chosen, cross, drives, ends, large_drives, storage_drives, tables
+from benchmarks import (
+    chosen,
+    cross,
+    drives,
+    ends,
+    large_drives,
+    odometry,
+    own_copies,
+    storage_drives,
+    tables,
+)
 from benchmarks.drives import AS_IT_WAS, ELSEWHERE, HALF, NO_OTHER, bench_drives, drives_of
 from benchmarks.storage_drives import ANSWERS, Asked, bench_storage_drives, both_sides, drive_table
 from benchmarks.trainings import Route
@@ -173,6 +183,44 @@ def test_other_constants_are_tried_and_put_back(tmp_path, monkeypatch, capsys):
     assert len({row["calibration_error"] for row in rows}) > 1
     assert vars(constants) == before
     assert "SHARPENED 0.6: 1.2" in capsys.readouterr().out
+
+
+def test_copies_choose_for_the_drives_of_another_visit(tmp_path, monkeypatch):
+    for name, seed in {"a": 0, "b": 1}.items():
+        np.save(tmp_path / f"{name}.npy", pictures(seed))
+    route = Route("{data}/a.npy", "{data}/b.npy", 2, "0")
+    monkeypatch.setattr(own_copies, "ROUTES", {"walk": (route, None)})
+    settings = {name: own_copies.SETTINGS[name] for name in ("free, 0.6", own_copies.USUAL)}
+    monkeypatch.setattr(own_copies, "SETTINGS", settings)
+    benchmark("own_copies", tmp_path, "--out", tmp_path / "out")
+    usual, alone, alike, best = json.loads((tmp_path / "out" / "bench.json").read_text())["rows"]
+    assert usual["setting"] == own_copies.USUAL
+    assert best["auc"] >= max(usual["auc"], alone["auc"], alike["auc"])
+    assert alike["tau"] > alone["tau"]
+    monkeypatch.setattr(tables, "read", lambda _: {"rows": [usual, alone, alike, best]})
+    assert f"| walk | {usual['auc']:.3f} (both, 0.6) |" in tables.own_copies()
+
+
+def test_odometry_is_made_from_the_truth_and_helps(tmp_path, monkeypatch):
+    order = torch.arange(PLACES).roll(-30)[::3]  # over the end of a lap, at three times the speed
+    truth = as_ground_truth(order.tolist())
+    assert odometry.moves_of(truth, PLACES).tolist() == [0.0] + [3.0] * (len(order) - 1)
+    np.save(tmp_path / "a.npy", walk(0).numpy())
+    np.save(tmp_path / "b.npy", walk(1, 3.0)[::2].numpy())
+    (tmp_path / "truth.csv").write_text("".join(f"{i},{2 * i}\n" for i in range(60)))
+    route = Route("{data}/a.npy", "{data}/b.npy", 2, "{data}/truth.csv")
+    for module in (drives, odometry):
+        monkeypatch.setattr(module, "ROUTES", {"walk": (route, None)})
+    monkeypatch.setattr(odometry, "RATES", {"": None, ", a thousandth": 0.001})
+    monkeypatch.setattr(odometry, "DRIVEN", ("walk",))
+    benchmark("odometry", tmp_path, "--out", tmp_path / "out")
+    *rows, few = json.loads((tmp_path / "out" / "bench.json").read_text())["rows"]
+    without, noisy, longer = rows
+    assert "expected more than" in few["skipped"]
+    assert noisy["filter"] > without["filter"]
+    assert min(noisy["drive"], longer["drive"]) > without["drive"] - 0.05
+    monkeypatch.setattr(tables, "read", lambda _: {"rows": [*rows, few]})
+    assert tables.odometry().count("\n") >= 3
 
 
 def test_drives_leave_the_map_stand_still_and_see_it_otherwise(tmp_path, monkeypatch, capsys):
