@@ -257,7 +257,8 @@ def _rows_by(table: Table, role: str, keys: Sequence[Key], values: np.ndarray) -
     rows: dict[Key, int] = {}
     for row, key in enumerate(keys):
         first = rows.setdefault(key, row)
-        same, seen = np.array_equal(values[first], values[row], equal_nan=True), f"{role} {key} twice"
+        same = first == row or np.array_equal(values[first], values[row], equal_nan=True)
+        seen = f"{role} {key} twice"
         expect(same, f"the row of line {table.rows[first][0]} alone", f"{table.where(row)}: {seen}")
     return rows
 

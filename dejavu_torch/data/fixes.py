@@ -78,7 +78,8 @@ def checked_fixes(values: Fixes, degrees: bool = False, lines: Sequence[int] = (
 
 def metres(values: Fixes, degrees: bool) -> Fixes:
     """Coordinates (R,K) in metres, near enough to compare steps."""
-    across = np.cos(np.radians(np.nanmean(values[:, 0]))) if degrees and len(values) else 1.0
+    north = values[_known(values), :1]
+    across = np.cos(np.radians(north.mean())) if degrees and len(north) else 1.0
     found: Fixes = PER_DEGREE * values[:, :2] * [1.0, across] if degrees else values.copy()
     return found
 

@@ -367,7 +367,9 @@ def _of_coordinates(asked: Judged, numbers: Tensor, ground: Ground, rejected: bo
     ways = [Way.of("shift", moved, off, right, radius)] * _is_plain(found - middle, own, radius)
     exchanged = (_at(ground.own, asked.match.index[numbers]) - _at(ground.stored, queries)).norm(dim=1)
     ways.append(Way.of("exchanged", "with the two files exchanged", exchanged, right, radius))
-    found, own = found[:, :2], own[:, :2]
+    flat, found, own = found.shape[1] == 2 or any(way.holds for way in ways), found[:, :2], own[:, :2]
+    if not flat:
+        ways.append(Way.of("heights", "without heights", (found - own).norm(dim=1), right, radius))
     ways += _rows(found, queries, right, ground)
     if not any(way.holds and way.answers >= EXPLAINED * len(found) for way in ways):
         own_frames = all(_at_origin(table) for table in (ground.stored, ground.own))

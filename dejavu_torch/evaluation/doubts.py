@@ -21,6 +21,7 @@ from dejavu_torch.recognition.select import PROBABLE
 from dejavu_torch.types import Doubt, Facts, Match, Traverse
 
 CONTRADICT = "the answers contradict the truth"
+SOME, EQUAL = 20, 1e-4  # queries that are compared with all frames of the reference, and how near they are
 
 
 def doubts_of(run: Localization, truth: Truth | None, facts: Mapping[str, Any]) -> list[Doubt]:
@@ -31,7 +32,8 @@ def doubts_of(run: Localization, truth: Truth | None, facts: Mapping[str, Any]) 
     asked, own = asked[:: run.querying.copies].cpu(), run.reference_features.cpu()
     digests = digests_of(asked, follow=False)
     known = run.model.provenance.doubts(run.model.map, digests, run.query)
-    if not known and asked.shape == own.shape and torch.allclose(asked, own, atol=1e-4):
+    some = asked[torch.linspace(0, len(asked) - 1, min(SOME, len(asked))).round().long()]
+    if not known and bool((torch.cdist(some, own, torch.inf).amin(1) <= EQUAL).all()):
         known = [Doubt("provenance", THEMSELVES)]  # of a map without a digest
     return [*_judged(run, truth, facts), *known, *_otherwise(run)]
 

@@ -106,6 +106,13 @@ def test_longitudes_go_on_across_180_degrees():
     assert "20 fixes at 0, 0" in seen[0]
 
 
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("rows", [0, 1, 30])
+def test_degrees_of_which_none_is_known_are_left_as_they_are(rows):
+    found, seen = checked_fixes(np.full((rows, 2), np.nan), degrees=True)
+    assert (len(found), seen) == (rows, [])
+
+
 def test_a_jump_that_stays_is_told():
     path = changed(slice(150, 300), ROAD[150:] + np.array([0, 750]))
     found, seen = checked_fixes(path, lines=range(2, 302))

@@ -316,6 +316,19 @@ def test_heights_of_two_visits_that_differ_by_a_constant_are_moved(above, radius
     assert all(f"moved by (0.0, 0.0, {-above}) m" in str(doubt) for doubt in doubts)
 
 
+@pytest.mark.parametrize(
+    "heights", [0.2 * Q, 20 * torch.randn(300, generator=torch.Generator().manual_seed(0))]
+)
+def test_heights_that_drift_are_told_as_such(heights):
+    """No motion of the plane, which agrees as it is."""
+    one = torch.cat([PATH, torch.zeros(300, 1)], 1)
+    (doubt,) = contradictions(*grounds(one, torch.cat([PATH + 0.3, heights[:, None]], 1)))
+    assert doubt.kind == "heights"
+    assert str(doubt).endswith(
+        "300 of 300 confident answers agree with the coordinates of b.csv without heights"
+    )
+
+
 def visits(stored, own, noise):
     """Two with coordinates, the second with so much noise."""
     rows, other = (torch.randn(300, 16, generator=torch.Generator().manual_seed(seed)) for seed in (0, 1))

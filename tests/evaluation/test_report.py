@@ -190,7 +190,17 @@ STEPS = [  # facts, recall@1, verdict, steps
     ({"with_answer": 10}, 0.6, "Partly: 6 of 10 queries that have a right place", []),
     ({"kind": "templates"}, 0.2, "No: 4 of 20", ["--ordered", "--second", "localize"]),
     ({"kind": "spectral", "filter": True, "trained": {"steps": 1}}, 0.2, "No: ", ["localize"]),
-    ({"with_answer": 0}, 0.0, "No query has a right place", []),
+    ({"with_answer": 0}, 0.0, "No query has a right place by this ground truth.", ["no query has a right"]),
+    (
+        {
+            "with_answer": 0,
+            "kind": "spectral",
+            "rejection": {"off_map": {}},
+            "accepted": 9,
+            "accepted_right": 0,
+        },
+        *(0.0, "No query has a right place by this ground truth.", ["no query has a right", "localize"]),
+    ),
     (
         {"rejection": {"off_map": {}}, "accepted": 9, "accepted_right": 8},
         *(1.0, "Accepted and right: 8; accepted and wrong: 1; not accepted: 11.", ["--calibration"]),
