@@ -138,7 +138,7 @@ def read_coordinates(path: Path, traverse: Traverse) -> tuple[Coordinates, Tenso
     try:
         if "moved" in table:
             odometer = read_odometer(table, traverse)
-            seen.append("the column moved is used as an odometer, to match drives")
+            seen.append("the column moved is read as odometry, for drives and filters")
     except InputError as error:
         seen.append(f"the column moved is not used: {error}")
     if unused := table.unused():

@@ -182,8 +182,10 @@ def contradictions(asked: Judged, ground: Ground | None = None) -> list[Doubt]:
     relation = relation_of(places, queries, asked.within) if rejected else None
     if relation is None or relation.answers < EXPLAINED * len(numbers):
         return []
-    near = (places - relation.at(queries)).abs() <= asked.tolerance  # else a small tolerance rejects them
-    better = relation.last is not None or int(near.sum()) >= BETTER * int(asked.right[numbers].sum())
+    near = int(((places - relation.at(queries)).abs() <= asked.tolerance).sum())
+    # else a small tolerance rejects them
+    least = min(BETTER * int(asked.right[numbers].sum()), EXPLAINED * len(numbers))
+    better = relation.last is not None or near >= least
     return [_of_frames(relation, asked)] if better else []
 
 

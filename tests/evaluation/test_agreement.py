@@ -87,6 +87,13 @@ def test_an_offset_that_jumps_is_told_with_the_lines_that_mend_it(gap, whose):
     assert text.endswith(f"--interpolate and --truth FILE.csv with the lines {lines}")
 
 
+def test_a_truth_that_jumps_halfway_is_told():
+    ((kind, text),) = told(Q, Q - 40 * (Q >= 150))
+    assert kind == "offset"
+    assert "300 of 300 confident answers follow place = query" in text
+    assert told(Q + (Q % 3 - 1), Q, tolerance=0) == []  # a small tolerance
+
+
 @given(st.floats(0.2, 4.0), st.integers(-200, 200), st.integers(0, 2**16))
 def test_a_line_is_found_within_its_width(slope, offset, seed):
     noise = torch.Generator().manual_seed(seed)
