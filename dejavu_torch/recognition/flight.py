@@ -106,9 +106,10 @@ class Flight:
         presence = None if smoother.singly is None else smoother.singly.presence
         std = standardised(self.scores, self.means, presence)
         whole, mass = self.whole._replace(std=std), torch.empty_like(self.scores)
-        states = math.isqrt(len(mass)) * self.layout.rows * self.layout.columns
-        headings = chosen.HEADINGS if chosen.HEADINGS * states <= chosen.MOST_STATES else 1
-        motion = PlaneMotion(self.layout, self.rates, headings)
+        states = chosen.HEADINGS * math.isqrt(len(mass)) * self.layout.rows * self.layout.columns
+        stands = float(self.rates.moves[len(self.rates.moves) // 2])  # in the middle of the kernel
+        few = states > chosen.MOST_STATES or stands > chosen.STANDS
+        motion = PlaneMotion(self.layout, self.rates, 1 if few else chosen.HEADINGS)
         for block in explained(whole, self.evidence, motion):
             last = block.first + len(block.log)
             mass[block.first : last] = motion.folded(block.posterior)[:, :-1]
