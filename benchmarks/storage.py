@@ -458,7 +458,7 @@ def by(key: str, rows: Sequence[Row]) -> dict[str, list[Row]]:
     """The rows with figures, by case or family, in order."""
     found: dict[str, list[Row]] = {}
     for row in rows:
-        if row["skipped"] is None:
+        if row.get("skipped") is None:  # kept rows are without what is None
             found.setdefault(row[key], []).append(row)
     return found
 
