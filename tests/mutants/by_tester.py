@@ -6,6 +6,34 @@ from .mutant import Mutant
 
 MUTANTS = [
     Mutant(
+        "A flight that stands does so on every course as often.",
+        "dejavu_torch/recognition/plane.py",
+        "return torch.where(stands, moves, found * ((moves * ~stands).sum() / total))",
+        "return found * (moves.sum() / total)",
+        ("tests/test_area.py::-k masses_of_the_model",),
+    ),
+    Mutant(
+        "A course changes to one beside it, not to any.",
+        "dejavu_torch/recognition/plane.py",
+        "beside = (change.roll(1, 0) + change.roll(-1, 0)) / 2",
+        "beside = torch.full_like(change, 1 / headings)",
+        ("tests/test_area.py::-k masses_of_the_model",),
+    ),
+    Mutant(
+        "Over an area the correlation of queries ends where it rises.",
+        "dejavu_torch/recognition/evidence.py",
+        "(monotone & (lags > before))",
+        "(lags < 0)",
+        ("tests/recognition/test_evidence.py::-k returns",),
+    ),
+    Mutant(
+        "A truth that is right for half of the answers may be contradicted.",
+        "dejavu_torch/evaluation/agreement.py",
+        "least = min(BETTER * int(asked.right[numbers].sum()), EXPLAINED * len(numbers))",
+        "least = BETTER * int(asked.right[numbers].sum())",
+        ("tests/evaluation/test_agreement.py::-k jumps_halfway",),
+    ),
+    Mutant(
         "A frame is between two queries if it differs from both in few signs, not from one of them.",
         "dejavu_torch/recognition/provenance.py",
         "float(torch.stack([(differs & one).sum(1) for one in beside]).amin(0).sum())",
