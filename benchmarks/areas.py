@@ -106,7 +106,7 @@ def measured(seed: int) -> list[Row]:
         right = (where.values[best] - own.values[asked]).norm(dim=1) <= RADIUS
         row: Row = {"seed": seed, "contender": key, "bytes_per_place": size}
         rows.append(row | {"recall_at_1": float(right.double().mean())})
-        for names, at, flown in flights if key in FLOWN else ():
+        for names, at, flown in flights[: {"map": 2}.get(key, 1)] if key in FLOWN else ():
             smoother = PlaceSmoother(within=round(RADIUS / STRIDE))
             scorer = score(flown)
             found = localize_drive(DriveQuery(scorer, smoother, radius=0, asks=False))
