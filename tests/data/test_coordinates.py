@@ -322,11 +322,11 @@ def test_a_column_of_coordinates_is_cut_with_the_frames(tmp_path, caplog):
     np.testing.assert_allclose(some.moves, [[0, 0], [5, 13**0.5], [9, 41**0.5]])
     assert some.metres
     assert "not used" not in caplog.text
-    assert caplog.text.count("the column moved is used as an odometer") == 2
+    assert caplog.text.count("the column moved is read as odometry") == 2
     (tmp_path / "where.csv").write_text("x,y,moved\n" + "0,0,1\n" * 5 + "0,0,yes\n")
     assert open_source(source).odometer is None
     assert "the column moved is not used" in caplog.text
-    assert caplog.text.count("the column moved is used") == 2
+    assert caplog.text.count("the column moved is read") == 2
     assert "line 7: moved is 'yes'" in caplog.text
 
 
