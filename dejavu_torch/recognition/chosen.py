@@ -76,10 +76,9 @@ SCALES = 1.0, 0.95, 1.05, 0.9, 1.1, 0.85, 1.15  # of which a whole drive shows o
 FLIGHT_SEPARATION, LEAST_FLIGHT_SEPARATION = 3.0, 1.0  # standard deviations of scores
 SPREADS = 2.0, 0.7, 4.0  # windows that a step goes in each direction, and where that explains little
 FLIGHT_FITTED = 300  # queries in a row, from the middle
-# Headings, which answers know and the fit does not, up to so many states of the queries of a block, and so
-# large a share of queries at which the camera stands; how narrow they are, and the share that keeps one: on
-# seed 0 of `areas`, but for STANDS, on slow drives over areas of `cross`
-HEADINGS, MOST_STATES, STANDS, COURSE, KEEPS_COURSE = 8, 2**24, 0.5, 8.0, 0.92
+# Headings, which answers know and the fit does not, up to so many states of the queries of a block; how
+# narrow they are, and the share that keeps one: on seed 0 of `areas`
+HEADINGS, MOST_STATES, COURSE, KEEPS_COURSE = 8, 2**24, 8.0, 0.92
 
 # Answers, on recorded drives.
 DOUBT = 0.1  # nats for each deviation by which an answer's own score is worse than is usual in the drive

@@ -107,9 +107,7 @@ class Flight:
         std = standardised(self.scores, self.means, presence)
         whole, mass = self.whole._replace(std=std), torch.empty_like(self.scores)
         states = chosen.HEADINGS * math.isqrt(len(mass)) * self.layout.rows * self.layout.columns
-        stands = float(self.rates.moves[len(self.rates.moves) // 2])  # in the middle of the kernel
-        few = states > chosen.MOST_STATES or stands > chosen.STANDS
-        motion = PlaneMotion(self.layout, self.rates, 1 if few else chosen.HEADINGS)
+        motion = PlaneMotion(self.layout, self.rates, chosen.HEADINGS if states <= chosen.MOST_STATES else 1)
         for block in explained(whole, self.evidence, motion):
             last = block.first + len(block.log)
             mass[block.first : last] = motion.folded(block.posterior)[:, :-1]
