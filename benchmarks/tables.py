@@ -730,6 +730,8 @@ def made(name: str) -> str:
     source = name if file_of(name).exists() else "order" if name == "ordered" else "routes"
     facts = read(source)
     said = ", ".join(str(facts[key]) for key in ("commit", "date", "machine") if key in facts)
+    if older := sorted({row["commit"] for row in facts["rows"] if "commit" in row}):
+        said += f"; some rows of {', '.join(older)}"
     return f"{TABLES[name]()}\n*{file_of(source).name}: {said}.*\n"
 
 
