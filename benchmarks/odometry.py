@@ -50,7 +50,8 @@ def run_odometry(data: Path, *, out: Path, routes: Sequence[str] = (), seed: int
 
 
 def bench_odometry(case: str, known: Known, seed: int = 0) -> Iterator[Row]:
-    """A row without odometry, one with noise in each step, and one with steps that are all too long."""
+    """A row without odometry, one with noise in each step, one with steps that are all too long, and one with
+    the right steps in random order: the null control."""
     model, tolerance = known.model, known.tolerance
     moved, draw = moves_of(known.truth, model.map.places), torch.Generator().manual_seed(seed)
     noise = 1 + NOISE * torch.randn(len(moved), generator=draw).double()
@@ -58,6 +59,7 @@ def bench_odometry(case: str, known: Known, seed: int = 0) -> Iterator[Row]:
         "without": None,
         "noise": checked_moved(moved * noise.clamp(min=0), len(moved)),
         "too long": checked_moved(LONGER * moved, len(moved)),
+        "null": checked_moved(moved[torch.randperm(len(moved), generator=draw)], len(moved)),
     }
     lit = in_its_light(model, known.queries)
     for name, odometer in told.items():

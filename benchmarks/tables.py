@@ -479,7 +479,7 @@ def constants() -> str:
 
 def odometry() -> str:
     """AUC of whole drives and filters by odometry."""
-    names = ("without", "noise", "too long")
+    names = ("without", "noise", "too long", "null")
     table = [["AUC of drive / filter", *names]]
     for case, rows in by("case", read("odometry")["rows"]).items():
         own = {row["contender"]: row for row in rows}

@@ -215,7 +215,7 @@ def test_odometry_is_made_from_the_truth_and_helps(tmp_path, monkeypatch):
     monkeypatch.setattr(odometry, "DRIVEN", ("walk",))
     benchmark("odometry", tmp_path, "--out", tmp_path / "out")
     *rows, few = json.loads((tmp_path / "out" / "bench.json").read_text())["rows"]
-    without, noisy, longer = rows
+    without, noisy, longer, _ = rows
     assert "expected more than" in few["skipped"]
     assert noisy["filter"] > without["filter"]
     assert min(noisy["drive"], longer["drive"]) > without["drive"] - 0.05
